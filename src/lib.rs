@@ -1,0 +1,1 @@
+//! Nightflow: dense optical flow and velocity at night.
