@@ -1,0 +1,210 @@
+//! Stage 1: samples come in, from ROS 2, from zenoh or from a recording.
+
+use std::{sync::Arc, time::Duration};
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    clock::Stamp,
+    wire::{self, CameraInfo, Image, Imu, Range},
+};
+
+/// A camera frame as it came: the mosaic is looked at by [`crate::exposure`] only.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Frame {
+    /// The image as published.
+    pub image: Image,
+    /// When it arrived here.
+    pub received: Stamp,
+}
+
+impl Frame {
+    /// When the frame was taken.
+    pub fn stamp(&self) -> Stamp {
+        self.image.header.stamp.into()
+    }
+}
+
+/// Whatever can come in; each keeps its own stamp.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Sample {
+    /// A raw frame; shared, so that the recorder keeps it without a copy.
+    Frame(Arc<Frame>),
+    /// The camera's calibration.
+    Info(Arc<CameraInfo>),
+    /// Body rates.
+    Imu(Arc<Imu>),
+    /// Distance to the ground.
+    Range(Arc<Range>),
+}
+
+impl Sample {
+    /// The sample's own stamp.
+    pub fn stamp(&self) -> Stamp {
+        match self {
+            Sample::Frame(frame) => frame.stamp(),
+            Sample::Info(info) => info.header.stamp.into(),
+            Sample::Imu(imu) => imu.header.stamp.into(),
+            Sample::Range(range) => range.header.stamp.into(),
+        }
+    }
+}
+
+/// What a source answers.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Next {
+    /// The next sample. Small samples older than the frame come before it.
+    Sample(Sample),
+    /// Nothing came within the wait.
+    Idle,
+    /// Nothing will ever come again.
+    End,
+}
+
+/// What a source counted so far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Counts {
+    /// Frames that arrived whole.
+    pub arrived: u64,
+    /// Frames that a newer one displaced before they were taken.
+    pub displaced: u64,
+    /// Messages that could not be decoded.
+    pub torn: u64,
+    /// Small samples (gyro, range, calibration) that found their queue full.
+    pub overrun: u64,
+}
+
+/// Where samples come from.
+pub trait Source: Send {
+    /// The next sample, waiting for at most `wait`. A live source gives the newest frame and counts what it displaced.
+    fn next(&mut self, wait: Duration) -> Result<Next, Error>;
+    /// What was counted so far.
+    fn counts(&self) -> Counts;
+    /// Progress through a finite source, 0…1; `None` for a live one.
+    fn progress(&self) -> Option<f64> {
+        None
+    }
+}
+
+/// Why a source fails.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The source cannot be opened or was lost; it may come back.
+    #[error("camera source {source_name}: {reason}")]
+    Lost {
+        /// `ros2`, `zenoh` or the file.
+        source_name: String,
+        /// What happened.
+        reason: String,
+    },
+    /// One message could not be decoded; the source goes on.
+    #[error("a message on {topic} is torn: {reason}")]
+    Torn {
+        /// Topic or key.
+        topic: String,
+        /// Expected against found.
+        reason: String,
+    },
+    /// The settings make no sense.
+    #[error("camera settings: {0}")]
+    Settings(String),
+    /// A message could not be decoded.
+    #[error(transparent)]
+    Wire(#[from] wire::Error),
+}
+
+/// `[camera]`: where samples come from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// The source, by its name as a table: `[camera.source.ros2]`, `[camera.source.zenoh]`, `[camera.source.mcap]`.
+    pub source: SourceConfig,
+    /// Topic of the raw frames.
+    pub image_topic: String,
+    /// Topic of the calibration.
+    pub info_topic: String,
+    /// Topic of the body rates.
+    pub imu_topic: String,
+    /// Topic of the range finder.
+    pub range_topic: String,
+    /// A source is called lost after this time without a frame.
+    pub silence_s_max: f64,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            source: SourceConfig::Ros2(Ros2::default()),
+            image_topic: "/camera/image_raw".into(),
+            info_topic: "/camera/camera_info".into(),
+            imu_topic: "/imu/data_raw".into(),
+            range_topic: "/range".into(),
+            silence_s_max: 1.0,
+        }
+    }
+}
+
+/// The kinds of source.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SourceConfig {
+    /// ROS 2 over DDS.
+    Ros2(Ros2),
+    /// zenoh, plain keys or rmw_zenoh's.
+    Zenoh(Zenoh),
+    /// A recording.
+    Mcap(Mcap),
+}
+
+/// `[camera.source.ros2]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Ros2 {
+    /// DDS domain.
+    pub domain: u16,
+    /// Ask for reliable delivery instead of best effort.
+    pub reliable: bool,
+    /// Socket receive buffer; 0 takes what the kernel allows at most.
+    pub receive_buffer_bytes: usize,
+}
+
+impl Default for Ros2 {
+    fn default() -> Self {
+        Self { domain: 0, reliable: false, receive_buffer_bytes: 0 }
+    }
+}
+
+/// `[camera.source.zenoh]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Zenoh {
+    /// Endpoints to connect to; a ROS 2 machine's router listens on tcp/localhost:7447.
+    pub connect: Vec<String>,
+    /// Endpoints to listen on.
+    pub listen: Vec<String>,
+    /// Keys and attachments of rmw_zenoh (true), or the topic itself as the key (false).
+    pub rmw: bool,
+    /// ROS domain, first part of rmw_zenoh's keys.
+    pub domain: u16,
+}
+
+impl Default for Zenoh {
+    fn default() -> Self {
+        Self { connect: vec!["tcp/localhost:7447".into()], listen: vec![], rmw: true, domain: 0 }
+    }
+}
+
+/// `[camera.source.mcap]`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Mcap {
+    /// The recording.
+    pub path: std::path::PathBuf,
+    /// Keep the recording's own pace and drop as a live source does, instead of giving every frame.
+    pub realtime: bool,
+}
+
+/// Opens the source that the settings name.
+pub fn open(_config: &Config) -> Result<Box<dyn Source>, Error> {
+    Err(Error::Settings("no source is built in".into()))
+}

@@ -1,0 +1,1 @@
+//! The effective configuration: one section a stage.

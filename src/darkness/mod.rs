@@ -1,0 +1,1 @@
+//! The laboratory of the paper: noise models, synthetic flights and darkness, and evaluation.

@@ -1,0 +1,1 @@
+//! The loop: source, step, sinks; stop, counters, status.

@@ -1,0 +1,189 @@
+//! Stage 5: flow and velocity go out, to this machine's memory, to ROS 2 and to zenoh.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    camera::Sample,
+    clock::Stamp,
+    flow::{Flow, State},
+    motion::{Lack, Velocity},
+    wire,
+};
+
+/// Everything that one step found, but for the vectors themselves.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Moved {
+    /// Counts from 0.
+    pub step: u64,
+    /// Stamp of the older frame.
+    pub older: Stamp,
+    /// Stamp of the newer frame.
+    pub newer: Stamp,
+    /// The camera's optical frame.
+    pub frame_id: std::sync::Arc<str>,
+    /// Camera frame size, columns and rows.
+    pub camera_size: [u32; 2],
+    /// The raster of the flow.
+    pub grid: crate::flow::Grid,
+    /// Gain that both frames were given.
+    pub gain: f32,
+    /// Mean above black of the newer frame, 1 = white.
+    pub raw_mean: f32,
+    /// Part of the newer frame that is saturated.
+    pub saturated_part: f32,
+    /// Mean confidence of the flow.
+    pub confidence: f32,
+    /// How far it can be trusted.
+    pub state: State,
+    /// The velocity, or what it lacks.
+    pub velocity: Result<Velocity, Lack>,
+}
+
+/// One step as a sink sees it.
+#[derive(Clone, Copy)]
+pub struct Offer<'a> {
+    /// What was found.
+    pub moved: &'a Moved,
+    /// The vectors.
+    pub flow: Flow<'a>,
+    /// The developed newer frame, for previews.
+    pub image: &'a crate::exposure::Exposed,
+}
+
+/// Where results go.
+pub trait Sink: Send {
+    /// The sink's name in messages and counters.
+    fn name(&self) -> &'static str;
+    /// A sample that the pipeline is about to see; only a recorder cares.
+    fn sample(&mut self, _sample: &Sample) -> Result<(), Error> {
+        Ok(())
+    }
+    /// A step's results. Must not wait: what can't be taken now is lost, counted and said.
+    fn offer(&mut self, offer: &Offer<'_>) -> Result<(), Error>;
+    /// How the node fares, about once a second.
+    fn status(&mut self, _status: &wire::Status) -> Result<(), Error> {
+        Ok(())
+    }
+    /// Nothing follows: write out what is kept.
+    fn finish(&mut self) -> Result<(), Error> {
+        Ok(())
+    }
+    /// Steps or samples that this sink could not take.
+    fn lost(&self) -> u64 {
+        0
+    }
+}
+
+/// Why something did not go out.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The sink can't be opened.
+    #[error("{sink} can't be opened: {reason}")]
+    Open {
+        /// The sink's name.
+        sink: &'static str,
+        /// What is missing and what to do.
+        reason: String,
+    },
+    /// A step or sample was lost.
+    #[error("{sink} lost {what}: {reason}")]
+    Lost {
+        /// The sink's name.
+        sink: &'static str,
+        /// What was lost.
+        what: String,
+        /// Why.
+        reason: String,
+    },
+    /// There is too little shared memory.
+    #[error(
+        "/dev/shm has {free} bytes free, {needed} bytes are needed for flow of {width}×{height}; enlarge it or lower [flow] or [publish.iceoryx2] limits"
+    )]
+    SharedMemory {
+        /// Bytes free.
+        free: u64,
+        /// Bytes needed.
+        needed: u64,
+        /// Columns.
+        width: usize,
+        /// Rows.
+        height: usize,
+    },
+}
+
+/// `[publish]`: which sinks are open, and how.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// Shared memory on this machine; `None` (absent) closes it.
+    pub iceoryx2: Option<Iceoryx2>,
+    /// ROS 2 over DDS.
+    pub ros2: Option<Ros2>,
+    /// zenoh.
+    pub zenoh: Option<Zenoh>,
+    /// Topics stand under this name.
+    pub namespace: String,
+    /// Frame of reference of the published velocity (FLU).
+    pub body_frame: String,
+    /// Dense flow and preview go out over the network at most this often; 0 sends none.
+    pub image_hz_max: f64,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            iceoryx2: Some(Iceoryx2::default()),
+            ros2: None,
+            zenoh: None,
+            namespace: "/nightflow".into(),
+            body_frame: "base_link".into(),
+            image_hz_max: 2.0,
+        }
+    }
+}
+
+/// `[publish.iceoryx2]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Iceoryx2 {
+    /// Service names begin with this.
+    pub prefix: String,
+    /// The most readers of a service.
+    pub subscribers_max: usize,
+    /// Cells of the largest flow that must fit.
+    pub cells_max: usize,
+}
+
+impl Default for Iceoryx2 {
+    fn default() -> Self {
+        Self { prefix: "nightflow".into(), subscribers_max: 4, cells_max: 640 * 480 }
+    }
+}
+
+/// `[publish.ros2]`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Ros2 {
+    /// DDS domain.
+    pub domain: u16,
+}
+
+/// `[publish.zenoh]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Zenoh {
+    /// Endpoints to connect to.
+    pub connect: Vec<String>,
+    /// Endpoints to listen on.
+    pub listen: Vec<String>,
+    /// Keys, tokens and attachments of rmw_zenoh (true), or the topic itself as the key (false).
+    pub rmw: bool,
+    /// ROS domain.
+    pub domain: u16,
+}
+
+impl Default for Zenoh {
+    fn default() -> Self {
+        Self { connect: vec!["tcp/localhost:7447".into()], listen: vec![], rmw: true, domain: 0 }
+    }
+}
