@@ -1,5 +1,7 @@
 //! Stage 3: two developed images become dense optical flow with a confidence for every vector.
 
+pub mod wheel;
+
 use serde::{Deserialize, Serialize};
 
 use crate::{
