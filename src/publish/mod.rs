@@ -1,5 +1,7 @@
 //! Stage 5: flow and velocity go out, to this machine's memory, to ROS 2 and to zenoh.
 
+pub mod outgoing;
+
 use serde::{Deserialize, Serialize};
 
 use crate::{
