@@ -1,5 +1,7 @@
 //! Stage 1: samples come in, from ROS 2, from zenoh or from a recording.
 
+pub mod latest;
+
 use std::{sync::Arc, time::Duration};
 
 use serde::{Deserialize, Serialize};
@@ -72,6 +74,8 @@ pub struct Counts {
     pub torn: u64,
     /// Small samples (gyro, range, calibration) that found their queue full.
     pub overrun: u64,
+    /// Frames that their sender numbered and that never came: the network lost them.
+    pub missed: u64,
 }
 
 /// Where samples come from.
@@ -157,7 +161,7 @@ pub enum SourceConfig {
 }
 
 /// `[camera.source.ros2]`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Ros2 {
     /// DDS domain.
@@ -166,12 +170,6 @@ pub struct Ros2 {
     pub reliable: bool,
     /// Socket receive buffer; 0 takes what the kernel allows at most.
     pub receive_buffer_bytes: usize,
-}
-
-impl Default for Ros2 {
-    fn default() -> Self {
-        Self { domain: 0, reliable: false, receive_buffer_bytes: 0 }
-    }
 }
 
 /// `[camera.source.zenoh]`.
