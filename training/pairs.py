@@ -1,0 +1,89 @@
+"""Pairs for training and judging: clean scenes made into dark raw frames by the FCDN recipe `paper`."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from scenes import Textures, scene, uniform
+
+MEAN_LEVEL = 0.4
+DARKEST = 30.0
+
+
+def linear(first: torch.Tensor, second: torch.Tensor, jitter: bool = True):
+    """Tone curve and white balance undone by an inverse gamma per channel, one gain for both frames, mean about 0.4."""
+    batch = len(first)
+    gamma = uniform(batch * 3, 1.0, 2.4).view(batch, 3, 1, 1) if jitter else torch.full((batch, 3, 1, 1), 2.2)
+    target = uniform(batch, 0.25, 0.55) if jitter else torch.full((batch,), MEAN_LEVEL)
+    frames = [frame.clamp(1e-4, 1).pow(gamma) for frame in (first, second)]
+    gain = target / frames[0].mean((1, 2, 3)).clamp(min=0.01)
+    # A little flicker of lamps; and a picture that is mostly black is not brought up without bound.
+    flicker = 1 + (0.02 * torch.randn(batch) if jitter else torch.zeros(batch))
+    gain = gain.clamp(max=8.0)
+    return (frames[0] * gain.view(-1, 1, 1, 1)).clamp(0, 1), (frames[1] * (gain * flicker).view(-1, 1, 1, 1)).clamp(0, 1)
+
+
+def noisy(first: torch.Tensor, second: torch.Tensor, level: float | None = None):
+    """z ~ N(y, a y + b), clipped; `level` is the deviation at a grey of 0.4 in 1/255, drawn evenly over 0...30 if None.
+
+    The shot part grows against the read part as in the paper; the deviation differs a little from channel to channel,
+    since binning averages two greens and white balance multiplies red and blue.
+    """
+    batch = len(first)
+    levels = uniform(batch, 0, DARKEST) if level is None else torch.full((batch,), float(level))
+    deviation = (levels / 255).view(-1, 1, 1, 1) * uniform(batch * 3, 0.7, 1.3).view(batch, 3, 1, 1)
+    shot = uniform(batch, 0.3, 1.0).view(-1, 1, 1, 1)
+    a, b = deviation**2 * shot / MEAN_LEVEL, deviation**2 * (1 - shot)
+    return tuple((y + torch.randn_like(y) * torch.sqrt(a * y + b)).clamp(0, 1) for y in (first, second))
+
+
+def batch_of(textures: Textures, batch: int, height: int, width: int, level: float | None = None, clean: bool = False):
+    """A training batch: older, newer [B, 3, H, W] and the flow [B, 2, H, W]."""
+    first, second, flow = scene(textures, batch, height, width)
+    first, second = linear(first, second)
+    if not clean:
+        first, second = noisy(first, second, level)
+    return first, second, flow
+
+
+class HeldOut:
+    """A fixed set of clean pairs from photographs that training never sees, and their noisy versions."""
+
+    def __init__(self, packed: Path, count: int, height: int = 256, width: int = 320, seed: int = 7):
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            textures = Textures(packed, held_out=True)
+            parts = [batch_of(textures, 4, height, width, clean=True) for _ in range(-(-count // 4))]
+        self.first, self.second, self.flow = (torch.cat(p)[:count] for p in zip(*parts))
+
+    def at(self, level: float, seed: int = 11):
+        """Older and newer frames at a noise level of 0...30."""
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            return noisy(self.first, self.second, level)
+
+
+def read_flo(path: Path) -> np.ndarray:
+    """Middlebury .flo: [H, W, 2] in pixels, not-a-number where unknown."""
+    with open(path, "rb") as file:
+        magic = np.fromfile(file, "<f4", 1)
+        if magic.size != 1 or magic[0] != np.float32(202021.25):
+            raise ValueError(f"{path}: expected the .flo magic 202021.25, found {magic}")
+        width, height = np.fromfile(file, "<i4", 2)
+        values = np.fromfile(file, "<f4", 2 * width * height)
+    if values.size != 2 * width * height:
+        raise ValueError(f"{path}: expected {2 * width * height} values, found {values.size}")
+    flow = values.reshape(height, width, 2).copy()
+    flow[np.abs(flow).max(2) > 1e8] = np.nan
+    return flow
+
+
+def public_pairs(folder: Path):
+    """Name, older, newer [1, 3, H, W] in 0...1 and flow [1, 2, H, W] of every `NAME_flow.flo` in a folder."""
+    for flow_file in sorted(folder.glob("*_flow.flo")):
+        name = flow_file.name.removesuffix("_flow.flo")
+        frames = [np.asarray(Image.open(folder / f"{name}_img{i}.png").convert("RGB")) for i in (1, 2)]
+        older, newer = (torch.from_numpy(f.copy()).permute(2, 0, 1)[None].float() / 255 for f in frames)
+        yield name, older, newer, torch.from_numpy(read_flo(flow_file)).permute(2, 0, 1)[None]

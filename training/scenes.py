@@ -1,0 +1,195 @@
+"""Synthetic scenes with exact flow: photographs as textures on moving planes and on cut-out shapes.
+
+Every layer is a plane whose motion is a homography M from frame 1 to frame 2 (pixels), so the flow is M x - x without
+approximation. Displacements are drawn from a mixture with much weight on small ones, since a drone at 30 Hz sees
+mostly 0...8 px at 320x256.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+
+SIDE = 512
+HELD_OUT = 20
+# Least mean step between every fourth row of a window, in 1/255.
+DULL = 8.0
+# Share, least and greatest typical displacement in pixels.
+MIXTURE = ((0.05, 0.0, 0.0), (0.40, 0.2, 4.0), (0.35, 4.0, 12.0), (0.20, 12.0, 28.0))
+
+
+def pack(photographs: Path, target: Path) -> None:
+    """Squares of 512 px from every photograph, in a fixed order; the last 20 photographs are held out."""
+    files = sorted(photographs.glob("*.jpg"))
+    # A fixed shuffle, so that what is held out is not all from one source.
+    order = np.random.default_rng(5).permutation(len(files))
+    squares, owners = [], []
+    for rank, index in enumerate(order):
+        image = Image.open(files[index]).convert("RGB")
+        scale = SIDE / min(image.size)
+        image = image.resize([max(SIDE, round(s * scale)) for s in image.size], Image.LANCZOS)
+        pixels = np.asarray(image)
+        height, width = pixels.shape[:2]
+        wide = max(height, width) > 1.3 * SIDE
+        for y, x in {(0, 0), (height - SIDE, width - SIDE)} if wide else {((height - SIDE) // 2, (width - SIDE) // 2)}:
+            squares.append(pixels[y : y + SIDE, x : x + SIDE])
+            owners.append(rank)
+    np.savez(target, squares=np.stack(squares), owners=np.array(owners), names=[files[i].name for i in order])
+
+
+class Textures:
+    """Random windows out of the packed photographs."""
+
+    def __init__(self, packed: Path, held_out: bool):
+        with np.load(packed) as file:
+            held = file["owners"] >= file["owners"].max() + 1 - HELD_OUT
+            self.squares = torch.from_numpy(file["squares"][held == held_out])
+
+    def draw(self, batch: int, side: int) -> torch.Tensor:
+        """[B, 3, side, side] in 0...1, with random mirror images."""
+        windows = []
+        for _ in range(batch):
+            for _ in range(4):
+                y, x = torch.randint(SIDE - side + 1, (2,)).tolist()
+                window = self.squares[torch.randint(len(self.squares), ()), y : y + side, x : x + side]
+                # Skies and gradients teach little: most of them are drawn again.
+                thin = window[::4, ::4].float()
+                if (thin[1:] - thin[:-1]).abs().mean() > DULL or torch.rand(()) < 0.1:
+                    break
+            windows.append(window.flip(1) if torch.rand(()) < 0.5 else window)
+        return torch.stack(windows).permute(0, 3, 1, 2).float().div_(255)
+
+
+def uniform(batch: int, low: float, high: float) -> torch.Tensor:
+    """[B] drawn evenly."""
+    return low + (high - low) * torch.rand(batch)
+
+
+def magnitudes(batch: int) -> torch.Tensor:
+    """[B] typical displacement of a scene in pixels, from the mixture."""
+    shares = torch.tensor([share for share, _, _ in MIXTURE])
+    bounds = torch.tensor([bounds for _, *bounds in MIXTURE])[torch.multinomial(shares, batch, replacement=True)]
+    return bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) * torch.rand(batch)
+
+
+def homographies(magnitude, centre_x, centre_y, size: float) -> torch.Tensor:
+    """[B, 3, 3] about a centre: a shift of about `magnitude`, and turn, zoom, shear and tilt that move a point `size`
+    away by a like amount."""
+    batch = len(magnitude)
+    angle = uniform(batch, 0, 2 * math.pi)
+    shift = magnitude * uniform(batch, 0.2, 1.0)
+    rate = (magnitude / size).clamp(max=0.35)
+    turn, zoom, shear = (torch.randn(batch) * rate * s for s in (0.35, 0.35, 0.12))
+    tilt = torch.randn(batch, 2) * (rate / size * 0.2)[:, None]
+    scale = torch.exp(zoom)
+    rows = [
+        *(scale * torch.cos(turn), -scale * torch.sin(turn) + shear, shift * torch.cos(angle)),
+        *(scale * torch.sin(turn), scale * torch.cos(turn), shift * torch.sin(angle)),
+        *(tilt[:, 0], tilt[:, 1], torch.ones(batch)),
+    ]
+    core = torch.stack(rows, -1).view(batch, 3, 3)
+    return _shifts(centre_x, centre_y) @ core @ _shifts(-centre_x, -centre_y)
+
+
+def _shifts(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    matrix = torch.eye(3).repeat(len(x), 1, 1)
+    matrix[:, 0, 2], matrix[:, 1, 2] = x, y
+    return matrix
+
+
+def mapped(matrix: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """Homography [B, 3, 3] applied to points [B or 1, 2, H, W]."""
+    m = matrix[..., None, None]
+    x, y = points[:, 0], points[:, 1]
+    depth = (m[:, 2, 0] * x + m[:, 2, 1] * y + m[:, 2, 2]).clamp(min=0.2)
+    return torch.stack(
+        [
+            (m[:, 0, 0] * x + m[:, 0, 1] * y + m[:, 0, 2]) / depth,
+            (m[:, 1, 0] * x + m[:, 1, 1] * y + m[:, 1, 2]) / depth,
+        ],
+        1,
+    )
+
+
+class Surface:
+    """A photograph on a plane: how frame-1 pixels fall on the texture."""
+
+    def __init__(self, texture: torch.Tensor, height: int, width: int):
+        batch, self.texture, side = len(texture), texture, texture.shape[-1]
+        zoom, turn = torch.exp(uniform(batch, math.log(0.5), math.log(1.8))), torch.randn(batch) * 0.5
+        matrix = torch.eye(3).repeat(batch, 1, 1)
+        matrix[:, 0, 0] = matrix[:, 1, 1] = zoom * torch.cos(turn)
+        matrix[:, 1, 0], matrix[:, 0, 1] = zoom * torch.sin(turn), -zoom * torch.sin(turn)
+        matrix[:, 2, :2] = torch.randn(batch, 2) * (0.15 / max(height, width))
+        middle = torch.full((batch,), side / 2.0)
+        about = _shifts(torch.full((batch,), -width / 2.0), torch.full((batch,), -height / 2.0))
+        self.matrix = _shifts(middle, middle) @ matrix @ about
+
+    def colour(self, points: torch.Tensor) -> torch.Tensor:
+        """Colours [B, 3, H, W] at frame-1 points."""
+        grid = mapped(self.matrix, points) * (2.0 / self.texture.shape[-1]) - 1
+        return F.grid_sample(self.texture, grid.permute(0, 2, 3, 1), padding_mode="reflection", align_corners=False)
+
+
+class Outline:
+    """A soft cut-out in frame-1 pixels: a wavy, stretched (down to thin rods) shape, now and then with a hole or bars."""
+
+    def __init__(self, batch: int, height: int, width: int):
+        self.x, self.y = uniform(batch, 0, width), uniform(batch, 0, height)
+        self.radius = torch.exp(uniform(batch, math.log(7.0), math.log(0.45 * min(height, width))))
+        stretch = torch.exp(uniform(batch, 0, math.log(2.0)) + (torch.rand(batch) < 0.25) * uniform(batch, 0.3, 1.4))
+        self.stretch = torch.minimum(stretch, (self.radius / 1.5).sqrt().clamp(min=1))
+        self.turn = uniform(batch, 0, 2 * math.pi)
+        self.waves = torch.randint(2, 8, (batch, 3)).float()
+        self.heights = torch.rand(batch, 3) * torch.tensor([0.35, 0.2, 0.15])
+        self.phases = uniform(batch * 3, 0, 2 * math.pi).view(batch, 3)
+        self.hole = (torch.rand(batch) < 0.25) * uniform(batch, 0.3, 0.75)
+        self.barred = torch.rand(batch) < 0.2
+        self.pitch = uniform(batch, 6, 24)
+        self.present = (torch.rand(batch) < 0.75).float()
+
+    def cover(self, points: torch.Tensor) -> torch.Tensor:
+        """Opacity [B, 1, H, W] at frame-1 points."""
+        b = lambda v: v.view(-1, 1, 1)
+        dx, dy = points[:, 0] - b(self.x), points[:, 1] - b(self.y)
+        c, s = b(torch.cos(self.turn)), b(torch.sin(self.turn))
+        along, across = (c * dx + s * dy) / b(self.stretch), (c * dy - s * dx) * b(self.stretch)
+        distance = torch.sqrt(along * along + across * across + 1e-6)
+        angle = torch.atan2(across, along)
+        limit = 1.0
+        for j in range(3):
+            limit = limit + b(self.heights[:, j]) * torch.cos(b(self.waves[:, j]) * angle + b(self.phases[:, j]))
+        limit = b(self.radius) * limit
+        cover = (limit - distance + 0.5).clamp(0, 1)
+        cover = cover * (distance - b(self.hole) * limit + 0.5 + 2 * b((self.hole == 0).float())).clamp(0, 1)
+        bars = (b(self.pitch) * 0.5 * torch.cos((2 * math.pi / b(self.pitch)) * (c * dx + s * dy)) + 0.5).clamp(0, 1)
+        return (torch.where(b(self.barred), cover * bars, cover) * b(self.present))[:, None]
+
+
+def scene(textures: Textures, batch: int, height: int, width: int, shapes: int = 5):
+    """Two frames [B, 3, H, W] in 0...1 and the flow [B, 2, H, W] from the first to the second, in pixels."""
+    side = min(SIDE, 64 * math.ceil(1.6 * max(height, width) / 64))
+    size = 0.5 * math.hypot(height, width)
+    x, y = torch.arange(width).float(), torch.arange(height).float()
+    points = torch.stack(torch.meshgrid(x, y, indexing="xy"))[None]
+    middle = torch.full((batch,), width / 2.0), torch.full((batch,), height / 2.0)
+    magnitude = magnitudes(batch)
+    # Some scenes have a still camera and moving things, some a moving camera over still things.
+    camera = homographies(magnitude * (torch.rand(batch) > 0.1), *middle, size)
+    ground = Surface(textures.draw(batch, side), height, width)
+    first = ground.colour(points.expand(batch, -1, -1, -1))
+    second = ground.colour(mapped(camera.inverse(), points))
+    flow = mapped(camera, points) - points
+    for _ in range(shapes):
+        outline, surface = Outline(batch, height, width), Surface(textures.draw(batch, side), height, width)
+        own = homographies(magnitude * uniform(batch, 0.0, 1.2), outline.x, outline.y, 0.6 * size)
+        motion = camera @ own
+        origin = mapped(motion.inverse(), points)
+        cover, cover_second = outline.cover(points), outline.cover(origin)
+        first = torch.lerp(first, surface.colour(points.expand(batch, -1, -1, -1)), cover)
+        second = torch.lerp(second, surface.colour(origin), cover_second)
+        flow = torch.where(cover > 0.5, mapped(motion, points) - points, flow)
+    return first, second, flow
