@@ -12,6 +12,11 @@ pub struct KeyValue {
     pub value: String,
 }
 
+impl Message for KeyValue {
+    const PACKAGE: &'static str = "diagnostic_msgs";
+    const NAME: &'static str = "KeyValue";
+}
+
 /// `diagnostic_msgs/DiagnosticStatus`.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[allow(missing_docs)]
@@ -22,6 +27,11 @@ pub struct DiagnosticStatus {
     pub message: String,
     pub hardware_id: String,
     pub values: Vec<KeyValue>,
+}
+
+impl Message for DiagnosticStatus {
+    const PACKAGE: &'static str = "diagnostic_msgs";
+    const NAME: &'static str = "DiagnosticStatus";
 }
 
 /// `diagnostic_msgs/DiagnosticArray`.

@@ -13,6 +13,11 @@ pub struct Vector3 {
     pub z: f64,
 }
 
+impl Message for Vector3 {
+    const PACKAGE: &'static str = "geometry_msgs";
+    const NAME: &'static str = "Vector3";
+}
+
 /// `geometry_msgs/Vector3Stamped`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[allow(missing_docs)]
@@ -36,6 +41,11 @@ pub struct Quaternion {
     pub w: f64,
 }
 
+impl Message for Quaternion {
+    const PACKAGE: &'static str = "geometry_msgs";
+    const NAME: &'static str = "Quaternion";
+}
+
 impl Default for Quaternion {
     fn default() -> Self {
         Self { x: 0.0, y: 0.0, z: 0.0, w: 1.0 }
@@ -48,6 +58,11 @@ impl Default for Quaternion {
 pub struct Twist {
     pub linear: Vector3,
     pub angular: Vector3,
+}
+
+impl Message for Twist {
+    const PACKAGE: &'static str = "geometry_msgs";
+    const NAME: &'static str = "Twist";
 }
 
 /// `geometry_msgs/TwistStamped`.
@@ -70,6 +85,11 @@ pub struct TwistWithCovariance {
     pub twist: Twist,
     /// Row-major over (x, y, z, rotation about x, y, z).
     pub covariance: [[f64; 6]; 6],
+}
+
+impl Message for TwistWithCovariance {
+    const PACKAGE: &'static str = "geometry_msgs";
+    const NAME: &'static str = "TwistWithCovariance";
 }
 
 /// `geometry_msgs/TwistWithCovarianceStamped`.

@@ -40,6 +40,11 @@ pub struct RegionOfInterest {
     pub do_rectify: bool,
 }
 
+impl Message for RegionOfInterest {
+    const PACKAGE: &'static str = "sensor_msgs";
+    const NAME: &'static str = "RegionOfInterest";
+}
+
 /// `sensor_msgs/CameraInfo`; `k[0] == 0` means uncalibrated.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct CameraInfo {
@@ -109,4 +114,47 @@ pub struct Range {
 impl Message for Range {
     const PACKAGE: &'static str = "sensor_msgs";
     const NAME: &'static str = "Range";
+}
+
+/// `sensor_msgs/LaserScan`: distances in a plane, about the frame's z axis, counter-clockwise from x.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[allow(missing_docs)]
+pub struct LaserScan {
+    pub header: Header,
+    /// rad.
+    pub angle_min: f32,
+    pub angle_max: f32,
+    pub angle_increment: f32,
+    /// Seconds from one ray to the next.
+    pub time_increment: f32,
+    /// Seconds from one scan to the next.
+    pub scan_time: f32,
+    /// m.
+    pub range_min: f32,
+    pub range_max: f32,
+    /// m; +inf: nothing up to `range_max`; NaN: unknown (REP 117).
+    pub ranges: Vec<f32>,
+    /// Empty when there are none.
+    pub intensities: Vec<f32>,
+}
+
+impl Message for LaserScan {
+    const PACKAGE: &'static str = "sensor_msgs";
+    const NAME: &'static str = "LaserScan";
+}
+
+/// `sensor_msgs/CompressedImage`: an image file as a message.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[allow(missing_docs)]
+pub struct CompressedImage {
+    pub header: Header,
+    /// `jpeg`, `png`.
+    pub format: String,
+    #[serde(with = "serde_bytes")]
+    pub data: Vec<u8>,
+}
+
+impl Message for CompressedImage {
+    const PACKAGE: &'static str = "sensor_msgs";
+    const NAME: &'static str = "CompressedImage";
 }

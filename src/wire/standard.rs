@@ -13,6 +13,11 @@ pub struct Time {
     pub nanosec: u32,
 }
 
+impl Message for Time {
+    const PACKAGE: &'static str = "builtin_interfaces";
+    const NAME: &'static str = "Time";
+}
+
 /// `std_msgs/Header`.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Header {

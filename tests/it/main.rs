@@ -3,3 +3,4 @@
 
 mod latest;
 mod peers;
+mod wire;
