@@ -2,6 +2,9 @@
 
 pub mod outgoing;
 
+pub mod pictures;
+mod plot;
+
 use serde::{Deserialize, Serialize};
 
 use crate::{
