@@ -79,6 +79,33 @@ pub trait Sink: Send {
     }
 }
 
+/// A sink that somebody else wants back afterwards.
+impl<S: Sink + ?Sized> Sink for &mut S {
+    fn name(&self) -> &'static str {
+        (**self).name()
+    }
+
+    fn sample(&mut self, sample: &Sample) -> Result<(), Error> {
+        (**self).sample(sample)
+    }
+
+    fn offer(&mut self, offer: &Offer<'_>) -> Result<(), Error> {
+        (**self).offer(offer)
+    }
+
+    fn status(&mut self, status: &wire::Status) -> Result<(), Error> {
+        (**self).status(status)
+    }
+
+    fn finish(&mut self) -> Result<(), Error> {
+        (**self).finish()
+    }
+
+    fn lost(&self) -> u64 {
+        (**self).lost()
+    }
+}
+
 /// Why something did not go out.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
