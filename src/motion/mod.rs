@@ -1,14 +1,26 @@
 //! Stage 4: flow, gyro and range become the body's velocity with a covariance.
+//!
+//! A point on the ground stands on the ray m₁ = (x₁, y₁, 1) of the older frame and on m₂ of the newer one. The gyro,
+//! integrated over exactly the interval, turns m₂ back into the older frame's axes: p₂. With n the unit vector to the
+//! ground, d the distance along it and t the camera's displacement, τ = t/d obeys
+//! x₂ − x₁ = (n·m₁)(−τ_x + x₂ τ_z) and the same in y: exact, and linear in τ. A seeded RANSAC starts the fit, and
+//! iteratively re-weighted least squares ends it.
 
-use serde::{Deserialize, Serialize};
+mod config;
+mod fit;
+mod ground;
+mod gyro;
+mod lens;
+mod odometer;
 
-use crate::{
-    clock::Stamp,
-    flow::Flow,
-    wire::{CameraInfo, Imu, Range},
-};
+pub use config::{AttitudeUse, Config, GyroUse, Mount, REASONS};
+pub use odometer::Odometer;
+
+use crate::clock::Stamp;
 
 /// Translational velocity of the body, FLU (x forward, y left, z up), at the newer frame's stamp.
+///
+/// It is the mean over the interval between the frames, in the body axes of the newer frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Velocity {
     /// Stamp of the older frame.
@@ -19,7 +31,9 @@ pub struct Velocity {
     pub linear: [f64; 3],
     /// rad/s, mean over the interval, body frame.
     pub angular: [f64; 3],
-    /// Row-major over (linear, angular).
+    /// Row-major over (linear, angular): flow noise by the residuals and the number of effectively independent vectors,
+    /// gyro, range, tilt and stamps by the settings or their messages. An axis that was not observed has a large
+    /// variance, never 0.
     pub covariance: [[f64; 6]; 6],
     /// Whether `linear` is metric.
     pub scale: Scale,
@@ -27,7 +41,8 @@ pub struct Velocity {
     pub samples: u32,
     /// Flow vectors that agreed.
     pub inliers: u32,
-    /// 0 none … 255.
+    /// 0 none … 255: 255 × part of the vectors that agree × their mean confidence. Provisional: it orders steps of one
+    /// flight, and is no probability.
     pub quality: u8,
 }
 
@@ -67,6 +82,16 @@ pub enum NoDistance {
         /// Metres.
         max: f64,
     },
+    /// The beam hits the ground too slantingly.
+    #[error(
+        "the range finder's beam stands at a cosine of {cosine:.2} to the ground's normal, at least {needed:.2} is needed"
+    )]
+    Slanting {
+        /// Between beam and normal.
+        cosine: f64,
+        /// The limit.
+        needed: f64,
+    },
 }
 
 /// Why there is no velocity at all.
@@ -78,6 +103,14 @@ pub enum Lack {
     /// No CameraInfo, or one that says "uncalibrated" (K[0] = 0).
     #[error("no calibration: CameraInfo is missing or has K[0] = 0")]
     Calibration,
+    /// The calibration belongs to frames of another size.
+    #[error("CameraInfo is for frames of {calibrated:?}, the frames are {frame:?} (columns, rows)")]
+    CameraSize {
+        /// Columns and rows after binning and region of interest.
+        calibrated: [u32; 2],
+        /// Columns and rows of the frame.
+        frame: [u32; 2],
+    },
     /// No gyro at all, and the settings ask for it.
     #[error("no gyro was received")]
     Gyro,
@@ -104,16 +137,38 @@ pub enum Lack {
     Degenerate,
 }
 
-/// `[motion]`: the vehicle's geometry and the fit.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Config {
-    /// The fewest vectors that must agree.
-    pub inliers_min: u32,
-}
-
-impl Default for Config {
-    fn default() -> Self {
-        Self { inliers_min: 60 }
-    }
+/// Why a sample or the settings were refused.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Error {
+    /// The settings make no sense.
+    #[error("motion settings: {0}")]
+    Settings(String),
+    /// A value that is no number.
+    #[error("{sensor} at {stamp}: {what} is not finite, the sample is refused")]
+    NotFinite {
+        /// `gyro`, `range` or `calibration`.
+        sensor: &'static str,
+        /// The sample's stamp.
+        stamp: Stamp,
+        /// Which value.
+        what: &'static str,
+    },
+    /// The clock went back.
+    #[error("{sensor}: its clock went back from {newest} to {stamp}, the sample is refused{}", if *anew { "; the series starts anew" } else { "" })]
+    Backwards {
+        /// `gyro` or `range`.
+        sensor: &'static str,
+        /// The sample's stamp.
+        stamp: Stamp,
+        /// The newest stamp before it.
+        newest: Stamp,
+        /// It went back so far that what was kept is forgotten.
+        anew: bool,
+    },
+    /// A distortion model that is not known here.
+    #[error("distortion model {model:?} is not known; plumb_bob, rational_polynomial and equidistant are")]
+    Distortion {
+        /// As the message names it.
+        model: String,
+    },
 }

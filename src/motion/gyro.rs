@@ -1,0 +1,177 @@
+//! Body rates and attitude: a bounded series of IMU samples, integrated over exactly the interval asked for.
+
+use std::collections::VecDeque;
+
+use nalgebra::{UnitQuaternion, Vector3};
+
+use super::{Config, Error, Lack};
+use crate::{clock::Stamp, wire::Imu};
+
+/// Four seconds at 1 kHz; what is older is of no use.
+const ROOM: usize = 4096;
+
+/// Going back by more than this is a clock that was set or a recording that was started again.
+pub(super) const ANEW_S: f64 = 1.0;
+
+#[derive(Debug, Clone, Copy)]
+struct Rate {
+    stamp: Stamp,
+    /// rad/s, body axes.
+    omega: Vector3<f64>,
+    /// rad²/s² a sample.
+    variance: f64,
+    /// The world's up in body axes, and how far it may be off in radians.
+    up: Option<(Vector3<f64>, f64)>,
+}
+
+/// IMU samples in the order of their stamps.
+#[derive(Debug)]
+pub(super) struct Rates {
+    ring: VecDeque<Rate>,
+    body: UnitQuaternion<f64>,
+}
+
+/// How the body turned between two stamps.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Turn {
+    /// Brings newer body axes to older ones.
+    pub(super) rotation: UnitQuaternion<f64>,
+    /// Mean rate, rad/s, body axes.
+    pub(super) mean: Vector3<f64>,
+    /// Rate at the older stamp.
+    pub(super) first: Vector3<f64>,
+    /// Rate at the newer stamp.
+    pub(super) last: Vector3<f64>,
+    /// rad² of the integrated angle, an axis.
+    pub(super) variance: f64,
+}
+
+impl Rates {
+    /// An empty series; `body` brings IMU axes to body axes.
+    pub(super) fn new(body: UnitQuaternion<f64>) -> Self {
+        Self { ring: VecDeque::with_capacity(ROOM), body }
+    }
+
+    /// Takes a sample.
+    pub(super) fn keep(&mut self, imu: &Imu, config: &Config) -> Result<(), Error> {
+        let stamp: Stamp = imu.header.stamp.into();
+        let omega = Vector3::new(imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z);
+        if !omega.iter().all(|w| w.is_finite()) {
+            return Err(Error::NotFinite { sensor: "gyro", stamp, what: "angular_velocity" });
+        }
+        if let Some(newest) = self.ring.back().map(|rate| rate.stamp)
+            && stamp <= newest
+        {
+            let anew = newest.seconds_since(stamp) > ANEW_S;
+            if anew {
+                self.ring.clear();
+            }
+            return Err(Error::Backwards { sensor: "gyro", stamp, newest, anew });
+        }
+        let stated = imu.angular_velocity_covariance[0];
+        let variance = if stated.is_finite() && stated > 0.0 { stated } else { config.gyro_sd_rad_s.powi(2) };
+        if self.ring.len() == ROOM {
+            self.ring.pop_front();
+        }
+        self.ring.push_back(Rate { stamp, omega: self.body * omega, variance, up: self.up(imu, config) });
+        Ok(())
+    }
+
+    /// The world's up in body axes, where the sample states an orientation. Drivers without one leave the identity and
+    /// zeros behind, or a covariance of −1.
+    fn up(&self, imu: &Imu, config: &Config) -> Option<(Vector3<f64>, f64)> {
+        let q = imu.orientation;
+        let covariance = &imu.orientation_covariance;
+        let untouched = [q.x, q.y, q.z, q.w] == [0.0, 0.0, 0.0, 1.0] && covariance.iter().all(|c| *c == 0.0);
+        let norm = (q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w).sqrt();
+        let stated = covariance[0] >= 0.0 && (0.9..1.1).contains(&norm);
+        if untouched || !stated {
+            return None;
+        }
+        let world = UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(q.w, q.x, q.y, q.z));
+        let variance = covariance[0].max(covariance[4]);
+        let sd = if variance.is_finite() && variance > 0.0 { variance.sqrt() } else { config.attitude_sd_rad };
+        Some((self.body * world.inverse_transform_vector(&Vector3::z()), sd))
+    }
+
+    /// Whether there was any sample.
+    pub(super) fn is_empty(&self) -> bool {
+        self.ring.is_empty()
+    }
+
+    /// The world's up in body axes at `stamp`, with its standard deviation.
+    pub(super) fn up_at(&self, stamp: Stamp, gap_s: f64) -> Option<(Vector3<f64>, f64)> {
+        let after = self.ring.partition_point(|rate| rate.stamp <= stamp);
+        let near = |rate: &&Rate| rate.stamp.seconds_since(stamp).abs() <= gap_s;
+        let before = after.checked_sub(1).and_then(|i| self.ring.get(i)).filter(near);
+        let behind = self.ring.get(after).filter(near);
+        match (before.and_then(|rate| Some((rate, rate.up?))), behind.and_then(|rate| Some((rate, rate.up?)))) {
+            (Some((a, (up_a, sd))), Some((b, (up_b, _)))) => {
+                let part = stamp.seconds_since(a.stamp) / b.stamp.seconds_since(a.stamp);
+                Some(((up_a * (1.0 - part) + up_b * part).normalize(), sd))
+            }
+            (Some((_, up)), None) | (None, Some((_, up))) => Some(up),
+            (None, None) => None,
+        }
+    }
+
+    /// The rate at `stamp`, and for how many seconds it had to be held.
+    fn at(&self, stamp: Stamp, gap_s: f64) -> Option<(Vector3<f64>, f64)> {
+        let after = self.ring.partition_point(|rate| rate.stamp <= stamp);
+        let before = after.checked_sub(1).and_then(|i| self.ring.get(i));
+        match (before, self.ring.get(after)) {
+            (Some(a), Some(b)) if b.stamp.seconds_since(a.stamp) <= gap_s => {
+                let part = stamp.seconds_since(a.stamp) / b.stamp.seconds_since(a.stamp);
+                Some((a.omega * (1.0 - part) + b.omega * part, 0.0))
+            }
+            (a, b) => [a, b]
+                .into_iter()
+                .flatten()
+                .map(|rate| (rate.omega, rate.stamp.seconds_since(stamp).abs()))
+                .filter(|(_, held)| *held <= gap_s)
+                .min_by(|x, y| x.1.total_cmp(&y.1)),
+        }
+    }
+
+    /// Integrates the rates from `older` to `newer`, interpolated at both ends.
+    pub(super) fn turn(&self, older: Stamp, newer: Stamp, config: &Config) -> Result<Turn, Lack> {
+        let gap_s = config.gyro_gap_s_max;
+        let interval_s = newer.seconds_since(older);
+        let gap = || Lack::GyroGap { covered_s: self.covered(older, newer, gap_s), interval_s };
+        let (first, held_first) = self.at(older, gap_s).ok_or_else(gap)?;
+        let (last, held_last) = self.at(newer, gap_s).ok_or_else(gap)?;
+        let begin = self.ring.partition_point(|rate| rate.stamp <= older);
+        let end = self.ring.partition_point(|rate| rate.stamp < newer);
+        let (mut rotation, mut angle, mut noise) = (UnitQuaternion::identity(), Vector3::zeros(), 0.0);
+        let (mut then, mut rate, mut longest) = (older, first, 0.0_f64);
+        let inner = self.ring.range(begin..end.max(begin)).map(|kept| (kept.stamp, kept.omega, kept.variance));
+        let variance_last = self.ring.back().map_or(0.0, |kept| kept.variance);
+        for (stamp, omega, variance) in inner.chain([(newer, last, variance_last)]) {
+            let h = stamp.seconds_since(then);
+            longest = longest.max(h);
+            // The second term is what a rate that changes its axis within the step adds (Magnus).
+            let step = (rate + omega) * (0.5 * h) + rate.cross(&omega) * (h * h / 12.0);
+            rotation *= UnitQuaternion::from_scaled_axis(step);
+            angle += (rate + omega) * (0.5 * h);
+            noise += variance * h * h;
+            (then, rate) = (stamp, omega);
+        }
+        if longest > gap_s {
+            return Err(gap());
+        }
+        let held = 0.5 * config.spin_sd_rad_s2 * (held_first.powi(2) + held_last.powi(2));
+        let variance = noise + (config.gyro_bias_sd_rad_s * interval_s).powi(2) + held * held;
+        Ok(Turn { rotation, mean: angle / interval_s, first, last, variance })
+    }
+
+    /// Seconds of the interval that lie between samples near enough to each other.
+    fn covered(&self, older: Stamp, newer: Stamp, gap_s: f64) -> f64 {
+        let mut covered = 0.0;
+        for (a, b) in self.ring.iter().zip(self.ring.iter().skip(1)) {
+            if b.stamp.seconds_since(a.stamp) <= gap_s {
+                covered += b.stamp.min(newer).seconds_since(a.stamp.max(older)).max(0.0);
+            }
+        }
+        covered
+    }
+}

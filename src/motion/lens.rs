@@ -1,0 +1,136 @@
+//! The calibrated camera: pixels of the frame become rays, distortion taken off.
+
+use super::Error;
+use crate::{clock::Stamp, wire::CameraInfo};
+
+/// A lens that was calibrated.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Lens {
+    focal: [f64; 2],
+    centre: [f64; 2],
+    binning: [f64; 2],
+    corner: [f64; 2],
+    model: Model,
+    size: [u32; 2],
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Model {
+    Pinhole,
+    /// k1 k2 p1 p2 k3 k4 k5 k6.
+    Radial([f64; 8]),
+    /// k1 … k4 over the angle.
+    Equidistant([f64; 4]),
+}
+
+impl Lens {
+    /// Reads a calibration; `None` where it says that there is none.
+    pub(super) fn read(info: &CameraInfo) -> Result<Option<Lens>, Error> {
+        let stamp: Stamp = info.header.stamp.into();
+        if info.k.iter().chain(&info.d).any(|value| !value.is_finite()) {
+            return Err(Error::NotFinite { sensor: "calibration", stamp, what: "K or D" });
+        }
+        if info.k[0] == 0.0 || info.k[4] == 0.0 {
+            return Ok(None);
+        }
+        let binning = [info.binning_x.max(1), info.binning_y.max(1)];
+        let whole = [info.width, info.height];
+        let part = [info.roi.width, info.roi.height];
+        let shown = if part == [0, 0] { whole } else { part };
+        Ok(Some(Lens {
+            focal: [info.k[0], info.k[4]],
+            centre: [info.k[2], info.k[5]],
+            binning: binning.map(f64::from),
+            corner: [f64::from(info.roi.x_offset), f64::from(info.roi.y_offset)],
+            model: Model::read(&info.distortion_model, &info.d)?,
+            size: [shown[0] / binning[0], shown[1] / binning[1]],
+        }))
+    }
+
+    /// Columns and rows of the frames that this lens belongs to; zero when the calibration does not say.
+    pub(super) fn size(&self) -> [u32; 2] {
+        self.size
+    }
+
+    /// Frame pixels per unit of (x, y) at the centre.
+    pub(super) fn focal(&self) -> f64 {
+        0.5 * (self.focal[0] / self.binning[0] + self.focal[1] / self.binning[1])
+    }
+
+    /// The ray (x, y, 1) of a pixel of the frame, pixel centres at whole numbers; `None` where the lens has none.
+    pub(super) fn ray(&self, pixel: [f64; 2]) -> Option<[f64; 2]> {
+        let full: [f64; 2] = std::array::from_fn(|i| (pixel[i] + 0.5) * self.binning[i] - 0.5 + self.corner[i]);
+        let distorted: [f64; 2] = std::array::from_fn(|i| (full[i] - self.centre[i]) / self.focal[i]);
+        self.model.undistort(distorted)
+    }
+}
+
+impl Model {
+    fn read(name: &str, d: &[f64]) -> Result<Model, Error> {
+        if d.iter().all(|k| *k == 0.0) && name != "equidistant" {
+            return Ok(Model::Pinhole);
+        }
+        let coefficient = |i: usize| d.get(i).copied().unwrap_or(0.0);
+        match name {
+            "plumb_bob" => Ok(Model::Radial(std::array::from_fn(|i| if i < 5 { coefficient(i) } else { 0.0 }))),
+            "rational_polynomial" => Ok(Model::Radial(std::array::from_fn(coefficient))),
+            "equidistant" => Ok(Model::Equidistant(std::array::from_fn(coefficient))),
+            other => Err(Error::Distortion { model: other.into() }),
+        }
+    }
+
+    fn undistort(&self, distorted: [f64; 2]) -> Option<[f64; 2]> {
+        match self {
+            Model::Pinhole => Some(distorted),
+            Model::Radial(k) => undistort_radial(k, distorted),
+            Model::Equidistant(k) => undistort_equidistant(k, distorted),
+        }
+    }
+}
+
+/// Fixed-point iteration: what distortion adds at the guess is taken off the measured point.
+fn undistort_radial(k: &[f64; 8], [xd, yd]: [f64; 2]) -> Option<[f64; 2]> {
+    let [mut x, mut y] = [xd, yd];
+    for _ in 0..60 {
+        let r2 = x * x + y * y;
+        let radial = (1.0 + ((k[4] * r2 + k[1]) * r2 + k[0]) * r2) / (1.0 + ((k[7] * r2 + k[6]) * r2 + k[5]) * r2);
+        let dx = 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x);
+        let dy = k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y;
+        if radial <= 0.1 {
+            return None;
+        }
+        let next = [(xd - dx) / radial, (yd - dy) / radial];
+        let moved = (next[0] - x).abs() + (next[1] - y).abs();
+        [x, y] = next;
+        if moved < 1e-13 {
+            return Some([x, y]);
+        }
+    }
+    None
+}
+
+fn undistort_equidistant(k: &[f64; 4], [xd, yd]: [f64; 2]) -> Option<[f64; 2]> {
+    let measured = xd.hypot(yd);
+    if measured < 1e-12 {
+        return Some([xd, yd]);
+    }
+    let mut angle = measured;
+    for _ in 0..20 {
+        let a2 = angle * angle;
+        let value = angle * (1.0 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3])))) - measured;
+        let slope = 1.0 + a2 * (3.0 * k[0] + a2 * (5.0 * k[1] + a2 * (7.0 * k[2] + a2 * 9.0 * k[3])));
+        if slope <= 0.1 {
+            return None;
+        }
+        angle -= value / slope;
+        if (value / slope).abs() < 1e-14 {
+            break;
+        }
+    }
+    // Beyond 80° a plane image has no room for the ray.
+    if !(0.0..1.4).contains(&angle) {
+        return None;
+    }
+    let stretch = angle.tan() / measured;
+    Some([xd * stretch, yd * stretch])
+}

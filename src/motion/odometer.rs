@@ -1,0 +1,307 @@
+//! The odometer: keeps gyro, range and calibration, and turns each step's flow into the body's velocity.
+
+use nalgebra::{Matrix3, Matrix6, Quaternion, Rotation3, UnitQuaternion, Vector3, Vector6};
+
+use super::{
+    AttitudeUse, Config, Error, GyroUse, Lack, Mount, NoDistance, Scale, Velocity,
+    fit::{Fit, Found, Sight},
+    ground::Ranges,
+    gyro::{Rates, Turn},
+    lens::Lens,
+};
+use crate::{
+    flow::Flow,
+    wire::{CameraInfo, Imu, Range},
+};
+
+/// (rad/s)² of a body rate that nothing observed.
+const UNOBSERVED: f64 = 1e6;
+
+/// Velocity from flow over the ground. It allocates nothing after its first step.
+#[derive(Debug)]
+pub struct Odometer {
+    config: Config,
+    /// Brings optical axes to body axes.
+    mount: Rotation3<f64>,
+    beam: Vector3<f64>,
+    lens: Option<Lens>,
+    rates: Rates,
+    ranges: Ranges,
+    fit: Fit,
+}
+
+/// The ground as seen from the older frame.
+struct Ground {
+    /// Unit vector to the ground, body axes.
+    normal: Vector3<f64>,
+    tilt_sd: f64,
+    distance: Result<Distance, NoDistance>,
+}
+
+struct Distance {
+    metres: f64,
+    sd: f64,
+    /// The point that the beam hit, from the camera, body axes: how a tilt's error changes the distance.
+    hit: Vector3<f64>,
+}
+
+impl Odometer {
+    /// Checks the settings.
+    pub fn new(config: &Config) -> Result<Odometer, Error> {
+        let mount = match config.camera {
+            Mount::Downward => axes([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+            Mount::Forward => axes([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+            Mount::Quaternion(q) => unit("camera", q)?.to_rotation_matrix(),
+        };
+        let beam = Vector3::from(config.range_direction);
+        if beam.norm() < 1e-6 || !beam.norm().is_finite() {
+            return Err(Error::Settings(format!(
+                "range_direction is {:?}, a direction is needed",
+                config.range_direction
+            )));
+        }
+        if config.samples_max < config.inliers_min as usize {
+            return Err(Error::Settings(format!(
+                "samples_max is {}, at least inliers_min = {} is needed",
+                config.samples_max, config.inliers_min
+            )));
+        }
+        let imu = unit("imu_quaternion", config.imu_quaternion)?;
+        Ok(Odometer {
+            config: config.clone(),
+            mount,
+            beam: beam.normalize(),
+            lens: None,
+            rates: Rates::new(imu),
+            ranges: Ranges::new(),
+            fit: Fit::default(),
+        })
+    }
+
+    /// Takes a calibration.
+    pub fn info(&mut self, info: &CameraInfo) -> Result<(), Error> {
+        self.lens = Lens::read(info)?;
+        Ok(())
+    }
+
+    /// Takes a gyro sample; refuses one that is not finite or whose clock went back.
+    pub fn imu(&mut self, imu: &Imu) -> Result<(), Error> {
+        self.rates.keep(imu, &self.config)
+    }
+
+    /// Takes a range; refuses one that is not a number or whose clock went back.
+    pub fn range(&mut self, range: &Range) -> Result<(), Error> {
+        self.ranges.keep(range)
+    }
+
+    /// The body's velocity by the flow between two frames of `camera_size` (columns, rows).
+    pub fn velocity(&mut self, flow: &Flow<'_>, camera_size: [u32; 2]) -> Result<Velocity, Lack> {
+        let lens = self.lens.as_ref().ok_or(Lack::Calibration)?;
+        if lens.size() != [0, 0] && lens.size() != camera_size {
+            return Err(Lack::CameraSize { calibrated: lens.size(), frame: camera_size });
+        }
+        let interval_s = flow.newer.seconds_since(flow.older);
+        if interval_s <= 0.0 {
+            return Err(Lack::Degenerate);
+        }
+        let focal = lens.focal();
+        let turn = self.turn(flow, interval_s)?;
+        let ground = self.ground(flow);
+        self.look(flow, &turn, &ground.normal);
+        let seed = u64::from(self.config.seed) ^ flow.older.ns().cast_unsigned();
+        let found = self.fit.solve(&self.config, seed)?;
+        Ok(self.conclude(flow, &turn, &ground, &found, interval_s, focal))
+    }
+
+    /// How the body turned, or how it may have where that need not be known.
+    fn turn(&self, flow: &Flow<'_>, interval_s: f64) -> Result<Turn, Lack> {
+        let measured = match self.rates.is_empty() {
+            true => Err(Lack::Gyro),
+            false => self.rates.turn(flow.older, flow.newer, &self.config),
+        };
+        match (measured, self.config.gyro) {
+            (Err(_), GyroUse::IfPresent) => Ok(Turn {
+                rotation: UnitQuaternion::identity(),
+                mean: Vector3::zeros(),
+                first: Vector3::zeros(),
+                last: Vector3::zeros(),
+                variance: (self.config.rate_unknown_sd_rad_s * interval_s).powi(2),
+            }),
+            (measured, _) => measured,
+        }
+    }
+
+    fn ground(&self, flow: &Flow<'_>) -> Ground {
+        let config = &self.config;
+        let stated = match config.attitude {
+            AttitudeUse::Imu => self.rates.up_at(flow.older, config.range_age_s_max),
+            AttitudeUse::Level => None,
+        };
+        let (up, tilt_sd) = stated.unwrap_or((Vector3::z(), config.level_sd_rad));
+        let normal = -up;
+        let distance = self.ranges.at(flow.older, flow.newer, config).and_then(|beam| {
+            let cosine = normal.dot(&self.beam);
+            let hit =
+                Vector3::from(config.range_offset_m) - Vector3::from(config.camera_offset_m) + self.beam * beam.range;
+            let metres = normal.dot(&hit);
+            if cosine < config.beam_cosine_min || metres <= 0.0 {
+                return Err(NoDistance::Slanting { cosine, needed: config.beam_cosine_min });
+            }
+            Ok(Distance { metres, sd: cosine * beam.variance.sqrt(), hit })
+        });
+        Ground { normal, tilt_sd, distance }
+    }
+
+    /// Fills the fit's raster: rays of both ends of each vector, the turn taken off.
+    fn look(&mut self, flow: &Flow<'_>, turn: &Turn, normal: &Vector3<f64>) {
+        let Some(lens) = &self.lens else { return };
+        let grid = flow.grid;
+        let mut step = 1;
+        while grid.width.div_ceil(step) * grid.height.div_ceil(step) > self.config.samples_max {
+            step += 1;
+        }
+        let back = self.mount.inverse() * turn.rotation.to_rotation_matrix() * self.mount;
+        let normal = self.mount.inverse() * normal;
+        let sight = |column: usize, row: usize| -> Option<Sight> {
+            let cell = row * grid.width + column;
+            let confidence = f64::from(*flow.confidence.get(cell)?);
+            let vector = flow.vectors.get(2 * cell..2 * cell + 2)?;
+            let usable = confidence >= self.config.confidence_min && vector.iter().all(|v| v.is_finite());
+            if !usable {
+                return None;
+            }
+            let pixel =
+                [(column, grid.scale[0]), (row, grid.scale[1])].map(|(i, s)| (i as f64 + 0.5) * f64::from(s) - 0.5);
+            let older = lens.ray(pixel)?;
+            let newer = lens.ray([pixel[0] + f64::from(vector[0]), pixel[1] + f64::from(vector[1])])?;
+            let ray = Vector3::new(older[0], older[1], 1.0);
+            let slope = normal.dot(&ray);
+            let turned = back * Vector3::new(newer[0], newer[1], 1.0);
+            if slope < self.config.grazing_cosine_min * ray.norm() || turned.z < 0.1 {
+                return None;
+            }
+            // A probability p of being right to within a pixel is a Gaussian of variance −1 / (2 ln(1 − p)) px².
+            let weight = -2.0 * (1.0 - confidence.min(0.999)).ln();
+            let newer = [turned.x / turned.z, turned.y / turned.z];
+            Some(Sight { older, newer, slope, weight, confidence, offered: true, ..Sight::default() })
+        };
+        self.fit.columns = grid.width.div_ceil(step);
+        self.fit.sights.clear();
+        for row in (step / 2..grid.height.max(step / 2 + 1)).step_by(step) {
+            for column in (step / 2..grid.width.max(step / 2 + 1)).step_by(step) {
+                self.fit.sights.push(sight(column, row).unwrap_or_default());
+            }
+        }
+        self.fit.columns = (step / 2..grid.width.max(step / 2 + 1)).step_by(step).count();
+    }
+
+    /// From the fit's camera axes to the newer body axes, with everything that makes the velocity uncertain.
+    fn conclude(
+        &self,
+        flow: &Flow<'_>,
+        turn: &Turn,
+        ground: &Ground,
+        found: &Found,
+        interval_s: f64,
+        focal: f64,
+    ) -> Velocity {
+        let config = &self.config;
+        let forward = turn.rotation.inverse();
+        let to_newer = forward.to_rotation_matrix() * self.mount;
+        let distance = ground.distance.as_ref();
+        let scale = distance.map_or(1.0, |d| d.metres) / interval_s;
+        // The camera's lever arm turns with the body; without a distance there are no metres to take it off in.
+        let arm = if distance.is_ok() { Vector3::from(config.camera_offset_m) } else { Vector3::zeros() };
+        let lever = (arm - forward * arm) / interval_s;
+        let camera = to_newer * found.tau * scale;
+        let linear = camera - lever;
+        let mut spread = Spread::default();
+        let to_body = to_newer.matrix() * scale;
+        spread.linear(&(to_body * found.covariance * to_body.transpose()));
+        for column in found.by_shift.column_iter() {
+            spread.error(to_body * column * (config.flow_shared_sd_px / focal), Vector3::zeros());
+        }
+        // An error of the turn, in the older body's axes, as it reaches the velocity and the mean rate.
+        let by_turn = to_body * found.by_turn * self.mount.inverse().matrix();
+        let turned = |error: Vector3<f64>| (by_turn * error - (error / interval_s).cross(&arm), error / interval_s);
+        for axis in 0..3 {
+            let (v, w) = turned(Vector3::ith(axis, turn.variance.sqrt()));
+            spread.error(v, w);
+        }
+        let (v, w) = turned((turn.last - turn.first) * config.gyro_offset_sd_s);
+        spread.error(v, w);
+        for (rate, sign) in [(turn.first, -1.0), (turn.last, 1.0)] {
+            let jitter = config.stamp_jitter_sd_s * sign;
+            let (v, w) = turned(rate * jitter);
+            spread.error(v - linear * (jitter / interval_s), w - turn.mean * (jitter / interval_s));
+        }
+        let side = ground.normal.cross(&Vector3::x()).try_normalize(0.1).unwrap_or_else(Vector3::y);
+        for tangent in [side, ground.normal.cross(&side)] {
+            let tilt = tangent * ground.tilt_sd;
+            let moved = to_body * found.by_normal * (self.mount.inverse() * tilt);
+            let longer = distance.map_or(0.0, |d| tilt.dot(&d.hit) / d.metres);
+            spread.error(moved - camera * longer, Vector3::zeros());
+        }
+        if let Ok(d) = distance {
+            spread.error(camera * (d.sd / d.metres), Vector3::zeros());
+        }
+        if config.gyro == GyroUse::IfPresent && self.rates.turn(flow.older, flow.newer, config).is_err() {
+            spread.unobserved();
+        }
+        let share = f64::from(found.inliers) / f64::from(found.samples.max(1));
+        Velocity {
+            older: flow.older,
+            newer: flow.newer,
+            linear: linear.into(),
+            angular: turn.mean.into(),
+            covariance: spread.rows(),
+            scale: match &ground.distance {
+                Ok(d) => Scale::Metric { distance: d.metres },
+                Err(why) => Scale::PerDistance(*why),
+            },
+            samples: found.samples,
+            inliers: found.inliers,
+            quality: (255.0 * share * found.confidence.min(1.0)).round() as u8,
+        }
+    }
+}
+
+/// The covariance of (linear, angular) as a sum of independent errors.
+#[derive(Default)]
+struct Spread(Matrix6<f64>);
+
+impl Spread {
+    fn linear(&mut self, covariance: &Matrix3<f64>) {
+        let mut block = self.0.fixed_view_mut::<3, 3>(0, 0);
+        block += covariance;
+    }
+
+    fn error(&mut self, linear: Vector3<f64>, angular: Vector3<f64>) {
+        let both = Vector6::new(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z);
+        self.0 += both * both.transpose();
+    }
+
+    /// Nothing is known of the rates: they are not correlated with anything, and anything they may be.
+    fn unobserved(&mut self) {
+        self.0.fixed_view_mut::<3, 3>(0, 3).fill(0.0);
+        self.0.fixed_view_mut::<3, 3>(3, 0).fill(0.0);
+        self.0.fixed_view_mut::<3, 3>(3, 3).copy_from(&(Matrix3::identity() * UNOBSERVED));
+    }
+
+    /// Symmetric to the bit.
+    fn rows(&self) -> [[f64; 6]; 6] {
+        std::array::from_fn(|i| std::array::from_fn(|j| self.0[(i.min(j), i.max(j))]))
+    }
+}
+
+fn axes(rows: [[f64; 3]; 3]) -> Rotation3<f64> {
+    Rotation3::from_matrix_unchecked(Matrix3::from_fn(|i, j| rows[i][j]))
+}
+
+fn unit(key: &str, [x, y, z, w]: [f64; 4]) -> Result<UnitQuaternion<f64>, Error> {
+    let quaternion = Quaternion::new(w, x, y, z);
+    if quaternion.norm() < 1e-6 || !quaternion.norm().is_finite() {
+        return Err(Error::Settings(format!("{key} is ({x}, {y}, {z}, {w}), no rotation")));
+    }
+    Ok(UnitQuaternion::from_quaternion(quaternion))
+}
