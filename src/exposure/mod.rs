@@ -1,10 +1,27 @@
 //! Stage 2: raw counts become a linear image of normal brightness, the same gain for both frames of a pair.
+//!
+//! A frame is looked through once, row by row: its bytes become counts, hot pixels are repaired, the rows are summed
+//! to the network's size, and what the counts say is held against what the settings declare. Nothing is clipped before
+//! the gain, so that noise around black keeps its mean. The image before the gain is kept, so that the older frame of a
+//! pair can be given another one.
 
 use std::sync::Arc;
 
-use serde::{Deserialize, Serialize};
-
 use crate::clock::Stamp;
+
+mod config;
+mod develop;
+mod error;
+mod gain;
+mod hot;
+mod layout;
+mod reduce;
+mod rows;
+mod sums;
+
+pub use config::{Config, Justification, Packing, Pattern, REASONS};
+pub use develop::Developer;
+pub use error::Error;
 
 /// A developed frame, ready for the network.
 ///
@@ -28,12 +45,14 @@ pub struct Exposed {
     pub saturated: Vec<u8>,
     /// Part of the developed pixels that are saturated.
     pub saturated_part: f32,
-    /// Mean above black before the gain, 1 = white level.
+    /// Mean of the three colours above black, before the gain and unclipped; 1 = white level.
     pub raw_mean: f32,
     /// The gain in `rgb`.
     pub gain: f32,
     /// Changes whenever `rgb` does, so that features computed from it can be kept.
     pub generation: u64,
+    /// The frame before had another stamp and the same bytes: the camera repeats itself.
+    pub frozen: bool,
 }
 
 /// Two frames under one gain.
@@ -43,22 +62,6 @@ pub struct Pair<'a> {
     pub older: &'a Exposed,
     /// The frame that just came.
     pub newer: &'a Exposed,
-    /// The light changed by more than the settings allow between the two (a lamp went on or off).
-    pub gain_step: bool,
-}
-
-/// `[exposure]`: how raw counts are read, and how they become an image.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Config {
-    /// Columns of the image that the network sees; rows follow from the camera's shape.
-    pub width_max: usize,
-    /// Mean that the gain brings the image to.
-    pub mean_target: f32,
-}
-
-impl Default for Config {
-    fn default() -> Self {
-        Self { width_max: 320, mean_target: 0.4 }
-    }
+    /// Newer mean over older mean, when the light changed by more than the settings allow (a lamp went on or off).
+    pub gain_step: Option<f32>,
 }
