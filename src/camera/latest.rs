@@ -113,6 +113,32 @@ impl Sender {
     }
 }
 
+/// Finds holes in the numbers that a publisher gives its messages.
+#[derive(Debug)]
+pub struct Numbers<P> {
+    last: Option<(P, i64)>,
+}
+
+impl<P> Default for Numbers<P> {
+    fn default() -> Self {
+        Self { last: None }
+    }
+}
+
+impl<P: PartialEq> Numbers<P> {
+    /// How many messages of this publisher are missing before this one; another publisher begins anew.
+    pub fn missed(&mut self, publisher: P, number: i64) -> u64 {
+        let (newest, missed) = match &self.last {
+            Some((known, last)) if *known == publisher => {
+                (number.max(*last), number.saturating_sub(*last).saturating_sub(1).max(0))
+            }
+            _ => (number, 0),
+        };
+        self.last = Some((publisher, newest));
+        missed.unsigned_abs()
+    }
+}
+
 impl Clone for Sender {
     fn clone(&self) -> Self {
         self.shared.lock().senders += 1;

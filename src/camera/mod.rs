@@ -1,6 +1,7 @@
 //! Stage 1: samples come in, from ROS 2, from zenoh or from a recording.
 
 pub mod latest;
+pub mod ros2;
 
 use std::{sync::Arc, time::Duration};
 
@@ -74,7 +75,7 @@ pub struct Counts {
     pub torn: u64,
     /// Small samples (gyro, range, calibration) that found their queue full.
     pub overrun: u64,
-    /// Frames that their sender numbered and that never came: the network lost them.
+    /// Frames that their sender numbered and that never came whole: the network lost or tore them.
     pub missed: u64,
 }
 
@@ -203,6 +204,10 @@ pub struct Mcap {
 }
 
 /// Opens the source that the settings name.
-pub fn open(_config: &Config) -> Result<Box<dyn Source>, Error> {
-    Err(Error::Settings("no source is built in".into()))
+pub fn open(config: &Config) -> Result<Box<dyn Source>, Error> {
+    match &config.source {
+        SourceConfig::Ros2(settings) => Ok(Box::new(ros2::Ros2Source::open(config, settings)?)),
+        SourceConfig::Zenoh(_) => Err(Error::Settings("zenoh is not built in".into())),
+        SourceConfig::Mcap(_) => Err(Error::Settings("recordings can't be read yet".into())),
+    }
 }

@@ -5,4 +5,5 @@ mod exposure;
 mod latest;
 mod motion;
 mod peers;
+mod ros2;
 mod wire;
