@@ -1,6 +1,7 @@
 //! Stage 1: samples come in, from ROS 2, from zenoh or from a recording.
 
 pub mod latest;
+pub mod mcap;
 pub mod ros2;
 
 use std::{sync::Arc, time::Duration};
@@ -208,6 +209,6 @@ pub fn open(config: &Config) -> Result<Box<dyn Source>, Error> {
     match &config.source {
         SourceConfig::Ros2(settings) => Ok(Box::new(ros2::Ros2Source::open(config, settings)?)),
         SourceConfig::Zenoh(_) => Err(Error::Settings("zenoh is not built in".into())),
-        SourceConfig::Mcap(_) => Err(Error::Settings("recordings can't be read yet".into())),
+        SourceConfig::Mcap(recording) => mcap::open(config, recording),
     }
 }

@@ -1,6 +1,70 @@
 //! Stage 6: what happened is kept in MCAP, and can be fed back.
 
+pub mod check;
+mod fields;
+mod outputs;
+mod pen;
+mod queue;
+mod recorder;
+mod repair;
+mod rosbag2;
+mod writer;
+
+use std::path::PathBuf;
+
 use serde::{Deserialize, Serialize};
+
+pub use outputs::{Output, Outputs, metadata};
+pub use recorder::Recorder;
+pub use repair::{Original, Repaired, repair};
+pub use writer::{Definition, Writer};
+
+use crate::wire;
+
+/// Why a recording can't be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The file system refuses.
+    #[error("{path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// The MCAP library refuses.
+    #[error("{path}: {source}")]
+    Mcap {
+        /// The file.
+        path: PathBuf,
+        /// What the library says.
+        source: ::mcap::McapError,
+    },
+    /// Two kinds of message on one topic.
+    #[error("{topic} carries {expected}, found {found}")]
+    Type {
+        /// The topic.
+        topic: String,
+        /// What the topic's channel was opened with.
+        expected: String,
+        /// What came.
+        found: String,
+    },
+    /// The file holds nothing that could be kept.
+    #[error("{path} is no MCAP file: {reason}")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// Expected against found.
+        reason: String,
+    },
+    /// The writing thread can't be started or is gone.
+    #[error("the recorder's thread: {0}")]
+    Thread(String),
+    /// A message can't become bytes.
+    #[error(transparent)]
+    Wire(#[from] wire::Error),
+}
 
 /// `[recording]`: what is kept, and how safely.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

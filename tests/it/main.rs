@@ -5,5 +5,6 @@ mod exposure;
 mod latest;
 mod motion;
 mod peers;
+mod recording;
 mod ros2;
 mod wire;
