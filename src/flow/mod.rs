@@ -1,12 +1,27 @@
 //! Stage 3: two developed images become dense optical flow with a confidence for every vector.
 
+mod config;
+mod error;
+mod fake;
+mod golden;
+mod manifest;
+mod matcher;
+mod network;
+mod onnx;
+pub mod padding;
+pub mod runtime;
+mod trust;
 pub mod wheel;
 
-use serde::{Deserialize, Serialize};
+use crate::clock::Stamp;
 
-use crate::{
-    clock::Stamp,
-    exposure::{Exposed, Pair},
+pub use self::{
+    config::{Config, REASONS, Resolution},
+    error::Error,
+    fake::Fake,
+    golden::Deviation,
+    matcher::{Counts, Matcher},
+    network::{Golden, Model, Network, Raster, Slot},
 };
 
 /// The raster that the flow is given on.
@@ -127,20 +142,4 @@ pub enum Cause {
     /// The camera repeats the same frame.
     #[error("the camera is frozen: frames of different stamps are equal to the bit")]
     Frozen,
-}
-
-/// `[flow]`: which network, on what.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Config {
-    /// The network's name in `models/manifest.toml`.
-    pub network: String,
-    /// Threads of the network.
-    pub threads: usize,
-}
-
-impl Default for Config {
-    fn default() -> Self {
-        Self { network: "pwcnet_fcdn".into(), threads: 2 }
-    }
 }

@@ -1,0 +1,114 @@
+//! `[flow]`: which network, where its files lie, and from when on its flow is not trusted.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+/// What raster the flow is given on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Resolution {
+    /// One vector for every 4 × 4 pixels of the developed image: what the network itself gives.
+    #[default]
+    Quarter,
+    /// One vector for every pixel of the developed image, by bilinear interpolation.
+    Full,
+}
+
+/// `[flow]`; [`REASONS`] says why each default is what it is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// The network's name in `models/manifest.toml`.
+    pub network: String,
+    /// Folder of the manifest and the graphs; empty: beside the executable, else the source tree it was built from.
+    pub models: PathBuf,
+    /// File of the ONNX Runtime library; empty: see [`crate::flow::runtime`].
+    pub runtime: PathBuf,
+    /// Threads of the network.
+    pub threads: usize,
+    /// What raster the flow is given on.
+    pub resolution: Resolution,
+    /// Run the network once at start and compare with the values that its exporter noted.
+    pub golden_check: bool,
+    /// Below this mean above black (1 = white) there is no trustworthy flow.
+    pub raw_mean_min: f32,
+    /// Below this mean above black flow is to be used with care.
+    pub raw_mean_degraded: f32,
+    /// Above this saturated part of either frame there is no trustworthy flow.
+    pub saturated_part_max: f32,
+    /// Above this saturated part of either frame flow is to be used with care.
+    pub saturated_part_degraded: f32,
+    /// Below this mean confidence there is no trustworthy flow.
+    pub confidence_min: f32,
+    /// Below this mean confidence flow is to be used with care.
+    pub confidence_degraded: f32,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            network: "pwcnet_fcdn".into(),
+            models: PathBuf::new(),
+            runtime: PathBuf::new(),
+            threads: 2,
+            resolution: Resolution::Quarter,
+            golden_check: true,
+            raw_mean_min: 0.001,
+            raw_mean_degraded: 0.002,
+            saturated_part_max: 0.5,
+            saturated_part_degraded: 0.1,
+            confidence_min: 0.1,
+            confidence_degraded: 0.3,
+        }
+    }
+}
+
+/// Why each default is what it is, by key.
+pub const REASONS: &[(&str, &str)] = &[
+    (
+        "network",
+        "PWC-Net without dense connections, trained on dark raw noise: half the multiplications of the dense one",
+    ),
+    (
+        "models",
+        "empty: models/ beside the executable, else the source tree, so that a clone and an installation both run",
+    ),
+    ("runtime", "empty: ORT_DYLIB_PATH, else beside the executable, else where the build put it"),
+    ("threads", "2: small boards have four cores, and the camera, the recorder and the autopilot's link need theirs"),
+    (
+        "resolution",
+        "quarter: the network knows no more than that, and the samples of a finer raster are not independent",
+    ),
+    ("golden_check", "a runtime that computes something else is found at start, for the price of one small pair"),
+    ("raw_mean_min", "0.001: half of the darkest raw mean that the network is trained for (0.002)"),
+    ("raw_mean_degraded", "0.002: the darkest raw mean that the network is trained for"),
+    ("saturated_part_max", "0.5: over half of the vectors would stand on pixels that say nothing"),
+    ("saturated_part_degraded", "0.1: a lamp or a strip of sky; more than that bends a fit over the image"),
+    (
+        "confidence_min",
+        "0.1: an expected error of 9.5 network pixels, more than the reach of the finest two cost volumes",
+    ),
+    ("confidence_degraded", "0.3: an expected error of 2.8 network pixels, most of one cell of the raster"),
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_key_has_a_reason_and_no_reason_is_left_over() {
+        let table = toml::Table::try_from(Config::default()).unwrap();
+        let mut keys: Vec<&str> = table.keys().map(String::as_str).collect();
+        let mut reasons: Vec<&str> = REASONS.iter().map(|(key, _)| *key).collect();
+        keys.sort_unstable();
+        reasons.sort_unstable();
+        assert_eq!(keys, reasons);
+    }
+
+    #[test]
+    fn a_misspelt_key_is_refused() {
+        let error = toml::from_str::<Config>("thread = 3").unwrap_err().to_string();
+        assert!(error.contains("unknown field `thread`"), "{error}");
+    }
+}

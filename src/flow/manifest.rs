@@ -1,0 +1,83 @@
+//! `models/manifest.toml`: which files make a network, and what they must be to the byte.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
+
+use serde::Deserialize;
+use sha2::{Digest, Sha256};
+
+use crate::flow::{Error, network::Golden};
+
+/// What the manifest says of a network that comes as a pyramid and a decoder.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Entry {
+    /// How the graphs are called: see [`Kind`].
+    pub kind: Kind,
+    /// ONNX operator set.
+    pub opset: u32,
+    /// The weights' version.
+    pub version: String,
+    /// The graph that looks at one frame.
+    pub pyramid: File,
+    /// The graph that finds the flow between two frames' features.
+    pub decoder: File,
+    /// What the exporter noted.
+    pub golden: Option<Golden>,
+}
+
+/// The ways that graphs can be called.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Kind {
+    /// `image` → `level2` … `level6`; two frames' levels and `scale` → `flow` and `uncertainty`.
+    PyramidDecoder,
+}
+
+/// One file of the models' folder.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct File {
+    /// Its name.
+    pub file: String,
+    /// Its hash, 64 hexadecimal digits.
+    pub sha256: String,
+}
+
+/// The folder that holds the manifest: the one that is set, else `models` beside the executable, else the source tree's.
+pub fn folder(set: &Path, executable: Option<&Path>) -> PathBuf {
+    if !set.as_os_str().is_empty() {
+        return set.to_path_buf();
+    }
+    let beside = executable.and_then(Path::parent).map(|folder| folder.join("models"));
+    match beside {
+        Some(beside) if beside.join("manifest.toml").exists() => beside,
+        _ => Path::new(env!("CARGO_MANIFEST_DIR")).join("models"),
+    }
+}
+
+/// The manifest's entry for `network`.
+pub fn entry(folder: &Path, network: &str) -> Result<Entry, Error> {
+    let path = folder.join("manifest.toml");
+    let wrong = |reason: String| Error::Manifest { path: path.clone(), reason };
+    let text =
+        fs::read_to_string(&path).map_err(|e| wrong(format!("{e}; set [flow] models to the folder of the models")))?;
+    let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| wrong(e.to_string()))?;
+    let names = table.keys().cloned().collect::<Vec<_>>().join(", ");
+    let entry =
+        table.remove(network).ok_or_else(|| wrong(format!("network {network} is not in it, it has {names}")))?;
+    entry.try_into().map_err(|e: toml::de::Error| wrong(format!("[{network}] {e}")))
+}
+
+/// The bytes of a file, which are what the manifest says.
+pub fn read(folder: &Path, file: &File) -> Result<Vec<u8>, Error> {
+    let path = folder.join(&file.file);
+    let bytes = fs::read(&path).map_err(|e| Error::Manifest { path: path.clone(), reason: e.to_string() })?;
+    let found: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+    if found != file.sha256 {
+        return Err(Error::Hash { path, expected: file.sha256.clone(), found, bytes: bytes.len() });
+    }
+    Ok(bytes)
+}

@@ -1,0 +1,261 @@
+//! One step: the features of two frames, the vectors between them, and a confidence for each.
+
+use crate::{
+    clock::Stamp,
+    exposure::{Exposed, Pair},
+    flow::{
+        Config, Error, Flow, Grid, Lender, Resolution,
+        golden::{self, Deviation},
+        network::{Model, Network, Raster, Slot},
+        onnx::Onnx,
+        padding::{self, Padded},
+    },
+};
+
+/// Pixels of the network's image in one cell of its raster.
+const CELL: usize = 4;
+
+/// Dense flow between the frames of a pair.
+pub struct Matcher {
+    pub(crate) config: Config,
+    network: Box<dyn Network>,
+    /// Whose features each slot holds.
+    described: [Option<Key>; 2],
+    /// The network's raster, where it is not the one that was asked for.
+    flow: Vec<f32>,
+    uncertainty: Vec<f32>,
+    counts: Counts,
+}
+
+/// What makes a frame's features what they are. The stamp is in it for frames that nobody numbered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Key {
+    generation: u64,
+    stamp: Stamp,
+    width: usize,
+    height: usize,
+}
+
+impl Key {
+    fn of(exposed: &Exposed) -> Self {
+        let Exposed { generation, stamp, width, height, .. } = *exposed;
+        Self { generation, stamp, width, height }
+    }
+}
+
+/// What a matcher did so far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Counts {
+    /// Frames whose features were computed.
+    pub described: u64,
+    /// Pairs.
+    pub pairs: u64,
+    /// Pairs whose flow was copied to the lent memory, because its raster is not the network's own.
+    pub copied: u64,
+}
+
+impl Matcher {
+    /// With the network that the settings name, through ONNX Runtime; checked against its golden output unless the
+    /// settings say otherwise.
+    pub fn open(config: &Config) -> Result<Self, Error> {
+        let mut matcher = Self::with(config, Box::new(Onnx::open(config)?));
+        if config.golden_check {
+            matcher.check_golden()?;
+        }
+        Ok(matcher)
+    }
+
+    /// With any network.
+    pub fn with(config: &Config, network: Box<dyn Network>) -> Self {
+        Self {
+            config: config.clone(),
+            network,
+            described: [None; 2],
+            flow: vec![],
+            uncertainty: vec![],
+            counts: Counts::default(),
+        }
+    }
+
+    /// Which network runs.
+    pub fn model(&self) -> &Model {
+        self.network.model()
+    }
+
+    /// What was done so far.
+    pub fn counts(&self) -> Counts {
+        Counts { copied: self.counts.copied + self.network.copied(), ..self.counts }
+    }
+
+    /// Computes the flow that the network's exporter noted and says how far it is off; an error if too far. `None`
+    /// where nothing was noted.
+    pub fn check_golden(&mut self) -> Result<Option<Deviation>, Error> {
+        self.described = [None; 2];
+        golden::check(self.network.as_mut())
+    }
+
+    /// The raster of the flow of this frame. At quarter resolution it has a cell for every whole 4 × 4 pixels.
+    pub fn grid(&self, exposed: &Exposed) -> Grid {
+        let [x, y] = exposed.scale;
+        let (width, height) = (exposed.width, exposed.height);
+        match self.config.resolution {
+            Resolution::Full => Grid { width, height, scale: [x, y] },
+            Resolution::Quarter => Grid {
+                width: (width / CELL).max(1),
+                height: (height / CELL).max(1),
+                scale: [x * CELL as f32, y * CELL as f32],
+            },
+        }
+    }
+
+    /// Flow from the older to the newer frame, in memory of `lender`.
+    ///
+    /// At quarter resolution and for sizes that are multiples of the network's stride the network writes straight into
+    /// the lent memory. Otherwise the result is copied there once, cut or enlarged.
+    pub fn between<'a>(&mut self, pair: &Pair<'_>, lender: &'a mut dyn Lender) -> Result<Flow<'a>, Error> {
+        let (older, newer) = (pair.older, pair.newer);
+        checked(older, newer)?;
+        let slot = self.describe_both(older, newer)?;
+        let grid = self.grid(older);
+        let canvas = lender.lend(&grid);
+        if canvas.flow.len() != 2 * grid.cells() || canvas.confidence.len() != grid.cells() {
+            return Err(Error::Lent {
+                cells: grid.cells(),
+                flow: canvas.flow.len(),
+                confidence: canvas.confidence.len(),
+            });
+        }
+        self.counts.pairs += 1;
+        let padded = Padded::new(older, self.network.stride());
+        let (columns, rows) = (padded.width / CELL, padded.height / CELL);
+        if padded.is_whole() && self.config.resolution == Resolution::Quarter {
+            let raster = Raster { flow: canvas.flow, uncertainty: canvas.confidence };
+            self.network.between(slot, older.scale, raster)?;
+            finish(canvas.flow, canvas.confidence)?;
+        } else {
+            self.counts.copied += 1;
+            self.flow.resize(columns * rows * 2, 0.0);
+            self.uncertainty.resize(columns * rows, 0.0);
+            let raster = Raster { flow: &mut self.flow, uncertainty: &mut self.uncertainty };
+            self.network.between(slot, older.scale, raster)?;
+            finish(&self.flow, &mut self.uncertainty)?;
+            if self.config.resolution == Resolution::Quarter {
+                padding::crop(&self.flow, columns, canvas.flow, grid.width, 2);
+                padding::crop(&self.uncertainty, columns, canvas.confidence, grid.width, 1);
+            } else {
+                padding::enlarge(&self.flow, (columns, rows), canvas.flow, grid.width, 2);
+                padding::enlarge(&self.uncertainty, (columns, rows), canvas.confidence, grid.width, 1);
+            }
+        }
+        mask(pair, &grid, canvas.flow, canvas.confidence);
+        let lender: &'a dyn Lender = lender;
+        let (vectors, confidence) = lender.lent();
+        Ok(Flow { older: older.stamp, newer: newer.stamp, grid, vectors, confidence })
+    }
+
+    /// Sees to it that both frames' features are there, computing only those that are not; where the older's are.
+    fn describe_both(&mut self, older: &Exposed, newer: &Exposed) -> Result<Slot, Error> {
+        let (older_key, newer_key) = (Key::of(older), Key::of(newer));
+        let holds = |described: &[Option<Key>; 2], key: Key| {
+            [Slot::A, Slot::B].into_iter().find(|slot| described[slot.index()] == Some(key))
+        };
+        if let Some(other) = self.described.into_iter().flatten().next()
+            && (other.width, other.height) != (older.width, older.height)
+        {
+            self.described = [None; 2];
+        }
+        let slot = match holds(&self.described, older_key) {
+            Some(slot) => slot,
+            None => {
+                let slot = holds(&self.described, newer_key).map_or(Slot::A, Slot::other);
+                self.describe(slot, older)?;
+                slot
+            }
+        };
+        if self.described[slot.other().index()] != Some(newer_key) {
+            self.describe(slot.other(), newer)?;
+        }
+        Ok(slot)
+    }
+
+    fn describe(&mut self, slot: Slot, exposed: &Exposed) -> Result<(), Error> {
+        self.described[slot.index()] = None;
+        self.network.describe(slot, &Padded::new(exposed, self.network.stride()))?;
+        self.described[slot.index()] = Some(Key::of(exposed));
+        self.counts.described += 1;
+        Ok(())
+    }
+}
+
+/// Refuses frames that make no pair.
+fn checked(older: &Exposed, newer: &Exposed) -> Result<(), Error> {
+    for exposed in [older, newer] {
+        let pixels = exposed.width * exposed.height;
+        if pixels == 0 || exposed.rgb.len() != 3 * pixels || exposed.saturated.len() != pixels {
+            return Err(Error::Image {
+                width: exposed.width,
+                height: exposed.height,
+                rgb: exposed.rgb.len(),
+                saturated: exposed.saturated.len(),
+            });
+        }
+    }
+    if (older.width, older.height) != (newer.width, newer.height) || older.scale != newer.scale {
+        return Err(Error::Differ {
+            older: (older.width, older.height, older.scale),
+            newer: (newer.width, newer.height, newer.scale),
+        });
+    }
+    Ok(())
+}
+
+/// Refuses what is no number, then turns expected errors into confidence where they stand.
+///
+/// An end-point error that is exponentially distributed with mean s is below one pixel with probability 1 − exp(−1/s).
+fn finish(flow: &[f32], uncertainty: &mut [f32]) -> Result<(), Error> {
+    let odd = |values: &[f32]| values.iter().filter(|value| !value.is_finite()).count();
+    let (vectors, errors) = (odd(flow), odd(uncertainty));
+    if vectors + errors > 0 {
+        return Err(Error::NotFinite {
+            flow: vectors,
+            of_flow: flow.len(),
+            uncertainty: errors,
+            of: uncertainty.len(),
+        });
+    }
+    for value in uncertainty {
+        // The smallest that still has a finite reciprocal with room to spare; its confidence is 1.
+        *value = 1.0 - (-1.0 / value.max(1e-6)).exp();
+    }
+    Ok(())
+}
+
+/// Takes the confidence from cells that stand on saturated pixels in either frame, and from those whose match has left
+/// the newer frame.
+fn mask(pair: &Pair<'_>, grid: &Grid, flow: &[f32], confidence: &mut [f32]) {
+    let (older, newer) = (pair.older, pair.newer);
+    let (width, height) = (older.width, older.height);
+    // Developed pixels per cell: 4 or 1; a frame of less than 4 pixels is one cell.
+    let side = (grid.scale[0] / older.scale[0]).round() as usize;
+    let spots = older.saturated_part > 0.0 || newer.saturated_part > 0.0;
+    for (index, (vector, confidence)) in flow.chunks_exact(2).zip(confidence).enumerate() {
+        let (column, row) = (index % grid.width, index / grid.width);
+        let centre = |cell: usize| (cell as f32 + 0.5) * side as f32 - 0.5;
+        let x = (centre(column) + vector[0] / older.scale[0] + 0.5).floor();
+        let y = (centre(row) + vector[1] / older.scale[1] + 0.5).floor();
+        let inside = x >= 0.0 && y >= 0.0 && x < width as f32 && y < height as f32;
+        if !inside
+            || (spots && (covered(older, column, row, side) || newer.saturated[y as usize * width + x as usize] != 0))
+        {
+            *confidence = 0.0;
+        }
+    }
+}
+
+/// Whether any pixel of a cell is saturated.
+fn covered(exposed: &Exposed, column: usize, row: usize, side: usize) -> bool {
+    let (left, top) = (column * side, row * side);
+    let right = (left + side).min(exposed.width);
+    (top..(top + side).min(exposed.height))
+        .any(|y| exposed.saturated[y * exposed.width..][left..right].iter().any(|&pixel| pixel != 0))
+}

@@ -1,0 +1,288 @@
+//! The session: a pyramid and a decoder in ONNX Runtime. The only file of this stage that is not pure.
+
+use std::{
+    env,
+    path::PathBuf,
+    sync::{Mutex, PoisonError},
+};
+
+use ort::{
+    environment::Environment,
+    memory::{Allocator, MemoryInfo},
+    session::{IoBinding, Session, builder::GraphOptimizationLevel},
+    value::{Outlet, Shape, Tensor, TensorRefMut, ValueType},
+};
+
+use crate::flow::{
+    Config, Error,
+    manifest::{self, Kind},
+    network::{Golden, Model, Network, Raster, Slot},
+    padding::Padded,
+    runtime::{self, Tried},
+};
+
+/// The pyramid's levels: level l has 1/2^l of the image's rows and columns.
+const LEVELS: [usize; 5] = [2, 3, 4, 5, 6];
+
+/// A pyramid and a decoder with their memory.
+///
+/// Features stay in ONNX Runtime's own memory: the pyramid's outputs are bound to the very tensors that the decoder's
+/// inputs are bound to, one set for each slot.
+pub struct Onnx {
+    pyramid: Graph,
+    decoder: Graph,
+    channels: [usize; 5],
+    memory: Option<Memory>,
+    scale: Tensor<f32>,
+    golden: Option<Golden>,
+    model: Model,
+    copied: u64,
+}
+
+/// A session and what is bound to it. Bindings must not outlive their session, hence the order of the fields.
+struct Graph {
+    binding: IoBinding,
+    session: Session,
+}
+
+/// The tensors for one size of image.
+struct Memory {
+    width: usize,
+    height: usize,
+    image: Tensor<f32>,
+    features: [Vec<Tensor<f32>>; 2],
+}
+
+/// An error of ONNX Runtime, with what it was asked to do.
+fn failed<R>(doing: &'static str) -> impl Fn(ort::Error<R>) -> Error {
+    move |error| Error::Session { doing, reason: error.to_string() }
+}
+
+/// A loaded library, and the file that it came from.
+type Loaded = (Environment, PathBuf);
+
+/// Loads the library once: a process can hold one only, and one environment of it.
+fn environment(config: &Config) -> Result<Loaded, Error> {
+    static LOADED: Mutex<Option<Loaded>> = Mutex::new(None);
+    let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
+    let executable = env::current_exe().ok();
+    let variable = env::var_os("ORT_DYLIB_PATH").map(Into::into);
+    let mut tried = Vec::new();
+    for place in runtime::places(&config.runtime, variable, executable.as_deref()) {
+        let reason = match (&*loaded, place.path.exists()) {
+            (_, false) => "there is no such file".into(),
+            (Some(held), true) if held.1 == place.path => return Ok(held.clone()),
+            (Some((_, held)), true) => format!("this process has loaded {} already", held.display()),
+            (None, true) => match ort::init_from(&place.path) {
+                Ok(builder) => {
+                    let environment = builder.with_name("nightflow").build().map_err(failed("start"))?;
+                    return Ok(loaded.insert((environment, place.path)).clone());
+                }
+                Err(error) => error.to_string(),
+            },
+        };
+        tried.push(Tried { place, reason });
+    }
+    Err(Error::Runtime { tried })
+}
+
+impl Graph {
+    /// Sequential, with a fixed number of threads: the order of every sum is fixed, so a replay gives the same bytes.
+    fn open(environment: &Environment, bytes: &[u8], threads: usize) -> Result<Self, Error> {
+        let doing = "set up a session";
+        let session = Session::builder(environment)
+            .map_err(failed(doing))?
+            .with_intra_threads(threads.max(1))
+            .map_err(failed(doing))?
+            .with_inter_threads(1)
+            .map_err(failed(doing))?
+            .with_parallel_execution(false)
+            .map_err(failed(doing))?
+            .with_deterministic_compute(true)
+            .map_err(failed(doing))?
+            .with_optimization_level(GraphOptimizationLevel::All)
+            .map_err(failed(doing))?
+            // Threads that spin for their next work between two frames would take the cores from the other stages.
+            .with_config_entry("session.force_spinning_stop", "1")
+            .map_err(failed(doing))?
+            .with_config_entry("session.record_ep_graph_assignment_info", "1")
+            .map_err(failed(doing))?
+            .commit_from_memory(bytes)
+            .map_err(failed("load a graph"))?;
+        let binding = session.create_binding().map_err(failed("bind"))?;
+        Ok(Self { binding, session })
+    }
+
+    /// Refuses a graph that lacks a name that it will be called by.
+    fn check(&self, file: &str, inputs: &[String], outputs: &[String]) -> Result<(), Error> {
+        for (found, wanted) in [(self.session.inputs(), inputs), (self.session.outputs(), outputs)] {
+            let found: Vec<&str> = found.iter().map(Outlet::name).collect();
+            if wanted.len() != found.len() || wanted.iter().any(|name| !found.contains(&name.as_str())) {
+                return Err(Error::Interface { file: file.into(), wanted: wanted.join(", "), found: found.join(", ") });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// `level2` … `level6`, each with a prefix.
+fn levels(prefix: &str) -> Vec<String> {
+    LEVELS.iter().map(|level| format!("{prefix}level{level}")).collect()
+}
+
+/// How many channels each level has, as the pyramid declares.
+fn channels(file: &str, pyramid: &Session) -> Result<[usize; 5], Error> {
+    let mut channels = [0; 5];
+    for (count, name) in channels.iter_mut().zip(levels("")) {
+        let declared =
+            pyramid.outputs().iter().find(|outlet| outlet.name() == name).and_then(|outlet| match outlet.dtype() {
+                ValueType::Tensor { shape, .. } if shape.len() == 4 => usize::try_from(shape[1]).ok(),
+                _ => None,
+            });
+        *count = declared.filter(|&count| count > 0).ok_or_else(|| Error::Interface {
+            file: file.into(),
+            wanted: format!("{name} as [1, a fixed number of channels, rows, columns]"),
+            found: format!("{:?}", pyramid.outputs()),
+        })?;
+    }
+    Ok(channels)
+}
+
+impl Onnx {
+    /// Finds the library and the network that the settings name, and checks both.
+    pub fn open(config: &Config) -> Result<Self, Error> {
+        let (environment, library) = environment(config)?;
+        let executable = env::current_exe().ok();
+        let folder = manifest::folder(&config.models, executable.as_deref());
+        let entry = manifest::entry(&folder, &config.network)?;
+        let Kind::PyramidDecoder = entry.kind;
+        let open = |file| Graph::open(&environment, &manifest::read(&folder, file)?, config.threads);
+        let (pyramid, decoder) = (open(&entry.pyramid)?, open(&entry.decoder)?);
+        pyramid.check(&entry.pyramid.file, &["image".into()], &levels(""))?;
+        let inputs = [levels("older_"), levels("newer_"), vec!["scale".into()]].concat();
+        decoder.check(&entry.decoder.file, &inputs, &["flow".into(), "uncertainty".into()])?;
+        let channels = channels(&entry.pyramid.file, &pyramid.session)?;
+        let provider = format!("CPUExecutionProvider of ONNX Runtime {}", version());
+        let sha256 = [entry.pyramid, entry.decoder].into_iter().map(|file| (file.file, file.sha256)).collect();
+        Ok(Self {
+            pyramid,
+            decoder,
+            channels,
+            memory: None,
+            scale: Tensor::from_array(([2usize], vec![1.0f32, 1.0])).map_err(failed("reserve memory"))?,
+            golden: entry.golden,
+            model: Model { name: config.network.clone(), version: entry.version, sha256, provider, library },
+            copied: 0,
+        })
+    }
+
+    /// The tensors for this size; new ones where it has changed.
+    fn memory(&mut self, width: usize, height: usize) -> Result<&mut Memory, Error> {
+        let fits = self.memory.as_ref().is_some_and(|memory| (memory.width, memory.height) == (width, height));
+        if !fits {
+            self.pyramid.binding.clear();
+            self.decoder.binding.clear();
+            self.memory = None;
+            self.memory = Some(Memory::new(width, height, &self.channels).map_err(failed("reserve memory"))?);
+        }
+        // The branch above has just filled it.
+        self.memory.as_mut().ok_or(Error::Session { doing: "reserve memory", reason: "there is none".into() })
+    }
+}
+
+impl Memory {
+    fn new(width: usize, height: usize, channels: &[usize; 5]) -> ort::Result<Self> {
+        let allocator = Allocator::default();
+        let level = |(&level, &count): (&usize, &usize)| {
+            Tensor::<f32>::new(&allocator, [1, count, height >> level, width >> level])
+        };
+        let slot = || LEVELS.iter().zip(channels).map(level).collect::<ort::Result<Vec<_>>>();
+        let image = Tensor::<f32>::new(&allocator, [1, 3, height, width])?;
+        Ok(Self { width, height, image, features: [slot()?, slot()?] })
+    }
+}
+
+impl Network for Onnx {
+    fn describe(&mut self, slot: Slot, image: &Padded<'_>) -> Result<(), Error> {
+        self.memory(image.width, image.height)?;
+        let Some(memory) = &mut self.memory else { return Ok(()) };
+        image.write(memory.image.extract_tensor_mut().1);
+        let Graph { binding, session } = &mut self.pyramid;
+        let mut run = || -> ort::Result<()> {
+            binding.bind_input("image", &memory.image)?;
+            for (name, tensor) in levels("").into_iter().zip(&mut memory.features[slot.index()]) {
+                binding.bind_output(name, tensor)?;
+            }
+            session.run_binding(binding).map(drop)
+        };
+        run().map_err(failed("run the pyramid"))
+    }
+
+    fn between(&mut self, older: Slot, scale: [f32; 2], out: Raster<'_>) -> Result<(), Error> {
+        let Some(memory) = &self.memory else {
+            return Err(Error::Session { doing: "run the decoder", reason: "no frame was looked at yet".into() });
+        };
+        let (rows, columns) = (memory.height / 4, memory.width / 4);
+        if out.flow.len() != rows * columns * 2 || out.uncertainty.len() != rows * columns {
+            return Err(Error::Lent { cells: rows * columns, flow: out.flow.len(), confidence: out.uncertainty.len() });
+        }
+        self.scale.extract_tensor_mut().1.copy_from_slice(&scale);
+        let Graph { binding, session } = &mut self.decoder;
+        let mut run = || -> ort::Result<u64> {
+            for (prefix, slot) in [("older_", older), ("newer_", older.other())] {
+                for (name, tensor) in levels(prefix).into_iter().zip(&memory.features[slot.index()]) {
+                    binding.bind_input(name, tensor)?;
+                }
+            }
+            binding.bind_input("scale", &self.scale)?;
+            bind(binding, "flow", out.flow, &[1, rows, columns, 2])?;
+            bind(binding, "uncertainty", out.uncertainty, &[1, rows, columns])?;
+            let outputs = session.run_binding(binding)?;
+            let mut copied = 0;
+            for (name, memory) in [("flow", &mut *out.flow), ("uncertainty", &mut *out.uncertainty)] {
+                let (_, values) = outputs[name].try_extract_tensor::<f32>()?;
+                // Bound memory is written in place; should a provider keep memory of its own, its values are fetched.
+                if values.as_ptr() != memory.as_ptr() {
+                    memory.copy_from_slice(values);
+                    copied += 1;
+                }
+            }
+            Ok(copied)
+        };
+        let result = run();
+        // Before anything else: the lent memory is not ours after this call.
+        binding.clear_outputs();
+        self.copied += result.map_err(failed("run the decoder"))?;
+        Ok(())
+    }
+
+    fn model(&self) -> &Model {
+        &self.model
+    }
+
+    fn golden(&self) -> Option<&Golden> {
+        self.golden.as_ref()
+    }
+
+    fn copied(&self) -> u64 {
+        self.copied
+    }
+}
+
+/// Binds an output to memory of the caller's. The caller clears the binding before that memory goes.
+fn bind(binding: &mut IoBinding, name: &str, memory: &mut [f32], shape: &[usize]) -> ort::Result<()> {
+    let shape = Shape::new(shape.iter().map(|&length| length as i64));
+    debug_assert_eq!(shape.num_elements(), memory.len());
+    // SAFETY: the pointer is valid for as many f32 in CPU memory as the shape says, and `between` clears the binding
+    // before the borrow of that memory ends.
+    let tensor: TensorRefMut<'_, f32> =
+        unsafe { TensorRefMut::from_raw(MemoryInfo::default(), memory.as_mut_ptr().cast(), shape)? };
+    binding.bind_output(name, tensor)
+}
+
+/// The loaded library's version, out of its build information.
+fn version() -> String {
+    let info = ort::info();
+    let branch = info.split("git-branch=").nth(1).and_then(|rest| rest.split(',').next());
+    branch.unwrap_or(info).trim_start_matches("rel-").to_string()
+}

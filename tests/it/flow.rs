@@ -1,0 +1,397 @@
+//! Flow: sizes, kept features, the real network through ONNX Runtime, and what is said when something is amiss.
+
+use std::{fs, path::Path};
+
+use nightflow::{
+    clock::Stamp,
+    exposure::{Exposed, Pair},
+    flow::{Cause, Config, Error, Fake, Flow, Grid, Lender, Matcher, Own, Resolution, State, runtime},
+};
+
+/// A textured scene seen through a window that stands at `at`.
+fn frame(width: usize, height: usize, at: (f64, f64), number: u64) -> Exposed {
+    let mut rgb = Vec::with_capacity(3 * width * height);
+    for c in 0..3 {
+        for y in 0..height {
+            for x in 0..width {
+                let (x, y, c) = (x as f64 + at.0, y as f64 + at.1, f64::from(c));
+                let coarse = (0.31 * x + 0.17 * y + c).sin() * (0.23 * y - 0.11 * x).cos();
+                let fine = (0.9 * x - 0.4 * y).sin() * (0.7 * y + 0.5 * x + c).sin();
+                rgb.push((0.4 + 0.2 * coarse + 0.12 * fine) as f32);
+            }
+        }
+    }
+    Exposed {
+        stamp: Stamp::from_ns(number as i64 * 33_000_000),
+        width,
+        height,
+        scale: [4.0, 4.0],
+        rgb,
+        saturated: vec![0; width * height],
+        raw_mean: 0.05,
+        gain: 8.0,
+        generation: number,
+        ..Exposed::default()
+    }
+}
+
+fn pair<'a>(older: &'a Exposed, newer: &'a Exposed) -> Pair<'a> {
+    Pair { older, newer, gain_step: None }
+}
+
+fn full() -> Config {
+    Config { resolution: Resolution::Full, ..Config::default() }
+}
+
+/// The real network, if its golden check passes.
+fn real() -> Matcher {
+    Matcher::open(&Config::default()).expect("the committed model opens and passes its golden check")
+}
+
+#[test]
+fn a_known_shift_comes_back_in_camera_pixels_at_every_size() {
+    for config in [Config::default(), full()] {
+        for (width, height) in [(320, 256), (100, 75), (64, 64), (30, 17), (3, 2), (1, 1)] {
+            let mut older = frame(width, height, (0.0, 0.0), 1);
+            older.scale = [4.0, 3.0];
+            let newer = Exposed { generation: 2, ..older.clone() };
+            let mut matcher = Matcher::with(&config, Box::new(Fake::shift(0.25, -0.5)));
+            let mut own = Own::default();
+            let flow = matcher.between(&pair(&older, &newer), &mut own).unwrap();
+            let cells = match config.resolution {
+                Resolution::Quarter => ((width / 4).max(1), (height / 4).max(1)),
+                Resolution::Full => (width, height),
+            };
+            let side = if config.resolution == Resolution::Quarter { 4.0 } else { 1.0 };
+            let grid = Grid { width: cells.0, height: cells.1, scale: [4.0 * side, 3.0 * side] };
+            assert_eq!(flow.grid, grid);
+            assert_eq!(matcher.grid(&older), grid);
+            assert_eq!((flow.vectors.len(), flow.confidence.len()), (2 * grid.cells(), grid.cells()));
+            assert!(flow.vectors.chunks(2).all(|v| v == [1.0, -1.5]), "{width}x{height}");
+        }
+    }
+}
+
+#[test]
+fn block_matching_finds_a_moved_scene_at_odd_sizes_and_on_both_rasters() {
+    for config in [Config::default(), full()] {
+        // The window goes (3, −2), so the scene goes (−3, 2).
+        let (older, newer) = (frame(150, 90, (0.0, 0.0), 1), frame(150, 90, (3.0, -2.0), 2));
+        let mut matcher = Matcher::with(&config, Box::new(Fake::matching(5)));
+        let mut own = Own::default();
+        let flow = matcher.between(&pair(&older, &newer), &mut own).unwrap();
+        let side = (flow.grid.scale[0] / 4.0) as usize;
+        let margin = 12 / side;
+        for row in margin..flow.grid.height - margin {
+            for column in margin..flow.grid.width - margin {
+                let vector = &flow.vectors[2 * (row * flow.grid.width + column)..][..2];
+                let off = (vector[0] / 4.0 + 3.0).hypot(vector[1] / 4.0 - 2.0);
+                assert!(off < 0.2, "row {row}, column {column}: {vector:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_full_raster_is_the_quarter_raster_between_its_cells() {
+    let (older, newer) = (frame(128, 128, (0.0, 0.0), 1), frame(128, 128, (1.5, 0.5), 2));
+    let (mut coarse, mut fine) = (Own::default(), Own::default());
+    let quarter = Matcher::with(&Config::default(), Box::new(Fake::matching(4)))
+        .between(&pair(&older, &newer), &mut coarse)
+        .unwrap()
+        .vectors
+        .to_vec();
+    let mut matcher = Matcher::with(&full(), Box::new(Fake::matching(4)));
+    let flow = matcher.between(&pair(&older, &newer), &mut fine).unwrap();
+    // The middle two of a cell's four pixels stand 1/8 of a cell before and behind its centre, so their mean is 7/8 of the
+    // cell and 1/16 of each neighbour.
+    let weights = [0.0625, 0.875, 0.0625];
+    for (row, column) in [(5, 7), (16, 16), (30, 3)] {
+        for c in 0..2 {
+            let mut want = 0.0;
+            for (j, wy) in weights.iter().enumerate() {
+                for (i, wx) in weights.iter().enumerate() {
+                    want += wx * wy * quarter[2 * ((row + j - 1) * 32 + column + i - 1) + c];
+                }
+            }
+            let mut got = 0.0;
+            for y in 4 * row + 1..4 * row + 3 {
+                for x in 4 * column + 1..4 * column + 3 {
+                    got += flow.vectors[2 * (y * 128 + x) + c] / 4.0;
+                }
+            }
+            assert!((got - want).abs() < 1e-4, "row {row}, column {column}: {got}, expected {want}");
+        }
+    }
+}
+
+#[test]
+fn features_are_computed_once_a_frame_and_again_when_the_gain_changes() {
+    let mut matcher = Matcher::with(&Config::default(), Box::new(Fake::matching(1)));
+    let mut own = Own::default();
+    let mut older = frame(64, 64, (0.0, 0.0), 1);
+    for number in 2..=10 {
+        let newer = frame(64, 64, (0.0, 0.0), number);
+        matcher.between(&pair(&older, &newer), &mut own).unwrap();
+        older = newer;
+    }
+    assert_eq!(matcher.counts().described, 10);
+    assert_eq!(matcher.counts().pairs, 9);
+    // Another gain: the older frame was developed anew.
+    older.generation = 11;
+    let newer = frame(64, 64, (0.0, 0.0), 12);
+    matcher.between(&pair(&older, &newer), &mut own).unwrap();
+    assert_eq!(matcher.counts().described, 12);
+    // Another size forgets everything.
+    let (older, newer) = (frame(80, 64, (0.0, 0.0), 11), frame(80, 64, (0.0, 0.0), 12));
+    matcher.between(&pair(&older, &newer), &mut own).unwrap();
+    assert_eq!(matcher.counts().described, 14);
+}
+
+#[test]
+fn kept_features_give_the_flow_that_fresh_ones_give() {
+    let frames: Vec<_> = (1..=5).map(|n| frame(64, 64, (n as f64 * n as f64 * 0.5, 0.0), n)).collect();
+    let mut kept = Matcher::with(&Config::default(), Box::new(Fake::matching(6)));
+    for two in frames.windows(2) {
+        let (mut a, mut b) = (Own::default(), Own::default());
+        let kept = kept.between(&pair(&two[0], &two[1]), &mut a).unwrap();
+        let mut fresh = Matcher::with(&Config::default(), Box::new(Fake::matching(6)));
+        let fresh = fresh.between(&pair(&two[0], &two[1]), &mut b).unwrap();
+        assert_eq!(kept.vectors, fresh.vectors);
+    }
+}
+
+#[test]
+fn saturated_cells_and_matches_outside_have_no_confidence() {
+    let mut older = frame(64, 64, (0.0, 0.0), 1);
+    older.saturated[5 * 64 + 9] = 1; // cell (1, 2)
+    older.saturated_part = 1.0 / 4096.0;
+    let mut newer = Exposed { generation: 2, saturated: vec![0; 4096], ..older.clone() };
+    newer.saturated[31 * 64 + 31] = 1; // where cell (6, 6), of centre (25.5, 25.5), goes under (5.5, 5.5)
+    let mut matcher = Matcher::with(&Config::default(), Box::new(Fake::shift(5.5, 5.5).with_uncertainty(1.0)));
+    let mut own = Own::default();
+    let flow = matcher.between(&pair(&older, &newer), &mut own).unwrap();
+    let at = |row: usize, column: usize| flow.confidence[row * 16 + column];
+    assert_eq!((at(1, 2), at(1, 3)), (0.0, 1.0 - (-1.0f32).exp()));
+    assert_eq!((at(6, 6), at(6, 7)), (0.0, 1.0 - (-1.0f32).exp()));
+    // Pixel 57.5 + 5.5 = 63 is the last one inside, 61.5 + 5.5 = 67 is outside.
+    assert!(at(14, 3) > 0.0 && at(15, 3) == 0.0 && at(3, 14) > 0.0 && at(3, 15) == 0.0);
+}
+
+#[test]
+fn flow_that_is_no_number_spoils_the_step_and_is_counted() {
+    let (older, newer) = (frame(70, 64, (0.0, 0.0), 1), frame(70, 64, (0.0, 0.0), 2));
+    let mut matcher = Matcher::with(&Config::default(), Box::new(Fake::shift(f32::NAN, 1.0)));
+    let error = matcher.between(&pair(&older, &newer), &mut Own::default()).unwrap_err();
+    insta::assert_snapshot!(error, @"the network gave 512 of 1024 flow values and 0 of 512 uncertainties that are not finite");
+}
+
+#[test]
+fn frames_that_make_no_pair_are_refused() {
+    let (older, newer) = (frame(64, 64, (0.0, 0.0), 1), frame(64, 60, (0.0, 0.0), 2));
+    let mut matcher = Matcher::with(&Config::default(), Box::new(Fake::shift(0.0, 0.0)));
+    let error = matcher.between(&pair(&older, &newer), &mut Own::default()).unwrap_err();
+    insta::assert_snapshot!(error, @"the older frame (width, height, scale) is (64, 64, [4.0, 4.0]), the newer (64, 60, [4.0, 4.0])");
+    let torn = Exposed { rgb: vec![0.0; 7], ..older.clone() };
+    let error = matcher.between(&pair(&torn, &older), &mut Own::default()).unwrap_err();
+    insta::assert_snapshot!(error, @"an image of 64 × 64 pixels has 7 values and 4096 of saturation");
+}
+
+/// The state of a step in which everything is well but what `change` spoils.
+fn state(uncertainty: f32, change: impl Fn(&mut Exposed, &mut Option<f32>)) -> State {
+    let older = frame(64, 64, (0.0, 0.0), 1);
+    let mut newer = frame(64, 64, (0.0, 0.0), 2);
+    let mut gain_step = None;
+    change(&mut newer, &mut gain_step);
+    let pair = Pair { older: &older, newer: &newer, gain_step };
+    let mut matcher = Matcher::with(&Config::default(), Box::new(Fake::shift(0.0, 0.0).with_uncertainty(uncertainty)));
+    let mut own = Own::default();
+    let flow: Flow = matcher.between(&pair, &mut own).unwrap();
+    let (state, mean) = matcher.judge(&pair, &flow);
+    let expected = 1.0 - (-1.0 / uncertainty).exp();
+    assert!((mean - expected).abs() < 1e-5, "mean confidence {mean}, expected {expected}");
+    state
+}
+
+#[test]
+fn every_cause_is_named_with_its_figure() {
+    assert_eq!(state(0.5, |_, _| ()), State::Ok);
+    let dark = |raw_mean, needed| Cause::Dark { raw_mean, needed };
+    assert_eq!(state(0.5, |f, _| f.raw_mean = 0.002), State::Ok);
+    assert_eq!(state(0.5, |f, _| f.raw_mean = 0.0019), State::Degraded(dark(0.0019, 0.002)));
+    assert_eq!(state(0.5, |f, _| f.raw_mean = 0.0009), State::Blind(dark(0.0009, 0.001)));
+    assert!(matches!(state(0.5, |f, _| f.raw_mean = f32::NAN), State::Blind(Cause::Dark { .. })));
+    let saturated = |part, allowed| Cause::Saturated { part, allowed };
+    assert_eq!(state(0.5, |f, _| f.saturated_part = 0.2), State::Degraded(saturated(0.2, 0.1)));
+    assert_eq!(state(0.5, |f, _| f.saturated_part = 0.6), State::Blind(saturated(0.6, 0.5)));
+    assert!(matches!(state(3.0, |_, _| ()), State::Degraded(Cause::Unsure { needed: 0.3, .. })));
+    assert!(matches!(state(12.0, |_, _| ()), State::Blind(Cause::Unsure { needed: 0.1, .. })));
+    assert_eq!(state(0.5, |_, step| *step = Some(3.5)), State::Degraded(Cause::GainStep { factor: 3.5 }));
+    assert_eq!(state(0.5, |f, _| f.frozen = true), State::Blind(Cause::Frozen));
+    // What was measured in the raw goes before what the network says, and blind before degraded.
+    assert_eq!(state(12.0, |f, _| f.raw_mean = 0.0), State::Blind(dark(0.0, 0.001)));
+    assert!(matches!(state(12.0, |_, step| *step = Some(3.0)), State::Blind(Cause::Unsure { .. })));
+}
+
+#[test]
+fn the_committed_model_passes_its_golden_check() {
+    let mut matcher = real();
+    let deviation = matcher.check_golden().unwrap().expect("the manifest holds a golden output");
+    assert!(deviation.worst <= deviation.tolerance);
+    let model = matcher.model();
+    assert_eq!(model.name, "pwcnet_fcdn");
+    assert!(model.provider.starts_with("CPUExecutionProvider"), "{model:?}");
+    assert_eq!(model.sha256.len(), 2);
+    assert!(model.sha256.iter().all(|(file, hash)| file.ends_with(".onnx") && hash.len() == 64));
+}
+
+/// Lends one place, and remembers where that was.
+#[derive(Default)]
+struct Watched {
+    own: Own,
+    lent_at: Vec<*const f32>,
+}
+
+impl Lender for Watched {
+    fn lend(&mut self, grid: &Grid) -> nightflow::flow::Canvas<'_> {
+        let canvas = self.own.lend(grid);
+        self.lent_at.push(canvas.flow.as_ptr());
+        canvas
+    }
+
+    fn lent(&self) -> (&[f32], &[f32]) {
+        self.own.lent()
+    }
+}
+
+#[test]
+fn the_network_writes_into_the_lent_memory_and_copies_once_where_it_must_cut() {
+    let mut matcher = real();
+    for (width, height, copied) in [(128, 64, 0), (100, 60, 1)] {
+        let before = matcher.counts();
+        let (older, newer) = (frame(width, height, (0.0, 0.0), 1), frame(width, height, (1.0, 1.0), 2));
+        let mut lender = Watched::default();
+        let address = {
+            let flow = matcher.between(&pair(&older, &newer), &mut lender).unwrap();
+            assert!(flow.vectors.iter().all(|value| value.is_finite()));
+            assert!(flow.vectors.iter().any(|&value| value != 0.0));
+            assert!(flow.confidence.iter().all(|value| (0.0..=1.0).contains(value)));
+            flow.vectors.as_ptr()
+        };
+        assert_eq!(lender.lent_at, [address]);
+        // ONNX Runtime's own pointer to its output was compared with this memory; a difference would be counted.
+        assert_eq!(matcher.counts().copied - before.copied, copied, "{width}x{height}");
+    }
+}
+
+#[test]
+fn the_real_network_keeps_features_and_gives_the_same_bits_again() {
+    let frames: Vec<_> = (1..=4).map(|n| frame(128, 128, (n as f64, -0.5 * n as f64), n)).collect();
+    let mut matcher = real();
+    let mut run = || {
+        let mut all = Vec::new();
+        for two in frames.windows(2) {
+            let mut own = Own::default();
+            let flow = matcher.between(&pair(&two[0], &two[1]), &mut own).unwrap();
+            all.extend(flow.vectors.iter().chain(flow.confidence).map(|value| value.to_bits()));
+        }
+        (all, matcher.counts().described)
+    };
+    let (first, described) = run();
+    assert_eq!(described, 4);
+    let (second, _) = run();
+    assert_eq!(first, second);
+    let mut fresh = real();
+    let mut own = Own::default();
+    let flow = fresh.between(&pair(&frames[2], &frames[3]), &mut own).unwrap();
+    let last: Vec<u32> = flow.vectors.iter().chain(flow.confidence).map(|value| value.to_bits()).collect();
+    assert_eq!(first[first.len() - last.len()..], last, "kept features give what fresh ones give");
+}
+
+/// A copy of the committed models.
+fn models() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    for file in fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("models")).unwrap() {
+        let path = file.unwrap().path();
+        if path.is_file() {
+            fs::copy(&path, folder.path().join(path.file_name().unwrap())).unwrap();
+        }
+    }
+    folder
+}
+
+fn refusal(folder: &Path) -> String {
+    match Matcher::open(&Config { models: folder.into(), ..Config::default() }) {
+        Ok(_) => panic!("the model was taken"),
+        Err(error) => error.to_string().replace(&folder.display().to_string(), "MODELS"),
+    }
+}
+
+#[test]
+fn a_model_with_one_changed_byte_is_refused() {
+    let folder = models();
+    let path = folder.path().join("pwcnet_fcdn_decoder.onnx");
+    let mut bytes = fs::read(&path).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    fs::write(&path, bytes).unwrap();
+    let text = refusal(folder.path());
+    assert!(text.contains("MODELS/pwcnet_fcdn_decoder.onnx") && text.contains("has sha256"), "{text}");
+    // Not even with the golden check left out.
+    let config = Config { models: folder.path().into(), golden_check: false, ..Config::default() };
+    assert!(matches!(Matcher::open(&config), Err(Error::Hash { .. })));
+}
+
+#[test]
+fn a_golden_output_that_differs_is_refused_unless_the_check_is_off() {
+    let folder = models();
+    let path = folder.path().join("manifest.toml");
+    let mut manifest: toml::Table = fs::read_to_string(&path).unwrap().parse().unwrap();
+    let golden = manifest["pwcnet_fcdn"]["golden"].as_table_mut().unwrap();
+    golden["flow"][3] = toml::Value::Float(golden["flow"][3].as_float().unwrap() + 0.5);
+    fs::write(&path, manifest.to_string()).unwrap();
+    let text = refusal(folder.path());
+    assert!(text.starts_with("the golden output differs at row 4, column 12: "), "{text}");
+    let config = Config { models: folder.path().into(), golden_check: false, ..Config::default() };
+    assert!(Matcher::open(&config).is_ok());
+}
+
+#[test]
+fn a_missing_network_or_manifest_is_named() {
+    let folder = models();
+    let config = Config { models: folder.path().into(), network: "raft".into(), ..Config::default() };
+    let text = Matcher::open(&config).map(drop).unwrap_err().to_string();
+    assert!(text.contains("network raft is not in it, it has pwcnet_fcdn"), "{text}");
+    fs::remove_file(folder.path().join("manifest.toml")).unwrap();
+    let text = refusal(folder.path());
+    insta::assert_snapshot!(text, @"MODELS/manifest.toml: No such file or directory (os error 2); set [flow] models to the folder of the models");
+}
+
+#[test]
+fn a_missing_runtime_says_where_it_was_looked_for_and_what_to_install() {
+    let config = Config { runtime: "/nowhere/libonnxruntime.so".into(), ..Config::default() };
+    let text = Matcher::open(&config).map(drop).unwrap_err().to_string();
+    insta::assert_snapshot!(text, @"
+    ONNX Runtime 1.31.1 is needed and was not found. Tried:
+      /nowhere/libonnxruntime.so ([flow] runtime): there is no such file
+    To install it: pip install --no-deps --target /opt/onnxruntime onnxruntime==1.31.1, and set [flow] runtime or ORT_DYLIB_PATH to /opt/onnxruntime/onnxruntime/capi/libonnxruntime.so.1.31.1
+    ");
+}
+
+#[test]
+fn the_runtime_is_looked_for_where_the_docs_say() {
+    let executable = Path::new("/app/target/debug/deps/it");
+    let shown = |set: &str, variable: Option<&str>| -> Vec<String> {
+        let places = runtime::places(Path::new(set), variable.map(Into::into), Some(executable));
+        places.into_iter().take(2).map(|place| format!("{}: {}", place.named_by, place.path.display())).collect()
+    };
+    assert_eq!(shown("/a.so", Some("/b.so")), ["[flow] runtime: /a.so"]);
+    assert_eq!(shown("", Some("/b.so")), ["ORT_DYLIB_PATH: /b.so"]);
+    assert_eq!(
+        shown("", Some("")),
+        [
+            "beside the executable: /app/target/debug/deps/libonnxruntime.so",
+            "above the executable: /app/target/debug/libonnxruntime.so"
+        ]
+    );
+}
