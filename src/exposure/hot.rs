@@ -38,30 +38,31 @@ pub(super) fn repair(
     }
     let above = above as u16;
     let mut changed = false;
-    // The pixels of a stretch are judged by the counts as they came, so a repaired stretch cannot lead to another.
-    let mut judge = |counts: &mut [u16], x: usize| {
-        if let Some(repaired) = judge(&Window { layout, bytes, x, y }, above, noise) {
-            counts[x] = repaired;
-            changed = true;
-        }
-    };
-    let mut next = 0;
-    while let Some(suspect) = rows::next_suspect(counts, stride, above, next) {
-        let start = stride + suspect * STRETCH;
-        for x in start..start + STRETCH {
-            let beside = layout.count(bytes, x - stride, y).max(layout.count(bytes, x + stride, y));
-            if counts[x].saturating_sub(beside) > above {
-                judge(counts, x);
+    // Repaired pixels are only ever lowered, so that among them the screen can find too many suspects but never too
+    // few; judged they are by the counts as they came.
+    let mut look = |counts: &mut [u16], pixels: std::ops::Range<usize>| {
+        for x in pixels {
+            let left = counts[if x < stride { x + stride } else { x - stride }];
+            let right = counts[if x + stride < width { x + stride } else { x - stride }];
+            if counts[x].saturating_sub(left.max(right)) > above
+                && let Some(repaired) = judge(&Window { layout, bytes, x, y }, above, noise)
+            {
+                counts[x] = repaired;
+                changed = true;
             }
         }
-        next = suspect + 1;
+    };
+    if width < STRETCH + 2 * stride {
+        look(counts, 0..width);
+        return changed;
     }
-    let stretched = stride + (width - 2 * stride) / STRETCH * STRETCH;
-    for x in (0..stride).chain(stretched..width) {
-        if counts[x] > above {
-            judge(counts, x);
-        }
+    let mut from = stride;
+    while let Some(suspect) = rows::next_suspect(counts, stride, above, from) {
+        look(counts, suspect..suspect + STRETCH);
+        from = suspect + STRETCH;
     }
+    look(counts, 0..stride);
+    look(counts, width - stride..width);
     changed
 }
 

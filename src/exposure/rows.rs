@@ -105,9 +105,10 @@ pub(super) fn measure(counts: &[u16], stride: usize) -> Found {
         found.bits |= count;
         found.max = found.max.max(*count);
     }
-    // A row is no longer than 65,536 pixels' worth of 16-bit differences in 32 bits only in chunks, hence two sums.
+    // The differences of 4096 pixels fit 32 bits; wrapping, as no check for overflow may stop the vectoriser.
     for (ours, next) in counts.chunks(4096).zip(counts.get(stride..).unwrap_or(&[]).chunks(4096)) {
-        let sum: u32 = ours.iter().zip(next).map(|(a, b)| u32::from(a.max(b) - a.min(b))).sum();
+        let pairs = ours.iter().zip(next);
+        let sum = pairs.fold(0u32, |sum, (a, b)| sum.wrapping_add(u32::from(a.abs_diff(*b))));
         found.differences += u64::from(sum);
     }
     found
@@ -124,64 +125,65 @@ pub(super) fn shift_down(counts: &mut [u16], by: u32) {
 /// The stretches of a row that are looked through at once.
 pub(super) const STRETCH: usize = 64;
 
-/// Whether any of the pixels `from..from + STRETCH` stands more than `above` over both neighbours of its colour.
-///
-/// `left`, `middle` and `right` are the same stretch seen from a stride before, on and after.
-#[inline(always)]
-fn stands_out(left: &[u16; STRETCH], middle: &[u16; STRETCH], right: &[u16; STRETCH], above: u16) -> bool {
-    let mut excess = 0;
-    for i in 0..STRETCH {
-        excess = excess.max(middle[i].saturating_sub(left[i].max(right[i])));
-    }
-    excess > above
-}
-
-/// The first stretch from number `first` on that may hold a hot pixel; stretches start at `stride` and lie end to end.
+/// The start of the first stretch from `from` on that holds a pixel which stands more than `above` over both neighbours
+/// of its colour. The last stretch is moved back so that it ends a stride before the row does.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-pub(super) fn next_suspect(counts: &[u16], stride: usize, above: u16, first: usize) -> Option<usize> {
-    let (left, _) = counts.as_chunks::<STRETCH>();
-    let (middle, _) = counts.get(stride..)?.as_chunks::<STRETCH>();
-    let (right, _) = counts.get(2 * stride..)?.as_chunks::<STRETCH>();
-    let count = right.len();
-    (first..count).find(|&i| stands_out(&left[i], &middle[i], &right[i], above))
+pub(super) fn next_suspect(counts: &[u16], stride: usize, above: u16, from: usize) -> Option<usize> {
+    let last = counts.len().checked_sub(stride + STRETCH).filter(|last| *last >= stride)?;
+    let mut start = from;
+    while start < last + STRETCH {
+        let here = start.min(last);
+        let seen = [here - stride, here, here + stride].map(|at| counts[at..].first_chunk::<STRETCH>());
+        let [Some(left), Some(middle), Some(right)] = seen else { return None };
+        let mut excess = 0;
+        for i in 0..STRETCH {
+            excess = excess.max(middle[i].saturating_sub(left[i].max(right[i])));
+        }
+        if excess > above {
+            return Some(here);
+        }
+        start += STRETCH;
+    }
+    None
 }
 
-/// A fingerprint that differs when any byte of any row does (but for one chance in 2⁶⁴).
+/// A fingerprint: rows of which one word differs never have the same one, others have it by chance only.
 #[derive(Debug, Clone)]
 pub(super) struct Fingerprint {
-    lanes: [u32; 32],
-    tail: u64,
+    lanes: [u32; 64],
 }
 
 impl Default for Fingerprint {
     fn default() -> Self {
-        Self { lanes: std::array::from_fn(|lane| 0x9e37_79b9 ^ lane as u32), tail: 0xcbf2_9ce4_8422_2325 }
+        Self { lanes: std::array::from_fn(|lane| 0x9e37_79b9 ^ lane as u32) }
     }
 }
 
 impl Fingerprint {
     /// Takes in a row. Each lane is a polynomial over its own column of words, which one multiplication a word makes.
     pub fn take(&mut self, bytes: &[u8]) {
-        let (blocks, tail) = bytes.as_chunks::<128>();
+        let (blocks, rest) = bytes.as_chunks::<256>();
         fold(&mut self.lanes, blocks);
-        for byte in tail {
-            self.tail = (self.tail ^ u64::from(*byte)).wrapping_mul(0x100_0000_01b3);
+        if !rest.is_empty() {
+            let mut block = [0; 256];
+            block[..rest.len()].copy_from_slice(rest);
+            fold(&mut self.lanes, &[block]);
         }
     }
 
     pub fn finish(&self) -> u64 {
-        self.lanes.iter().fold(self.tail, |print, lane| {
+        self.lanes.iter().fold(0xcbf2_9ce4_8422_2325, |print, lane| {
             (print ^ u64::from(*lane)).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(29)
         })
     }
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn fold(lanes: &mut [u32; 32], blocks: &[[u8; 128]]) {
+fn fold(lanes: &mut [u32; 64], blocks: &[[u8; 256]]) {
     let mut folded = *lanes;
     for block in blocks {
         let (words, _) = block.as_chunks::<4>();
-        for i in 0..32 {
+        for i in 0..64 {
             folded[i] = folded[i].wrapping_mul(0x85eb_ca6b).wrapping_add(u32::from_le_bytes(words[i]));
         }
     }

@@ -1,14 +1,16 @@
 //! The loops that sum counts and apply the gain, shaped for the vectoriser and compiled for several instruction sets.
 //!
 //! Each output value is made of the same operations in the same order whatever the width of the vectors, and Rust
-//! never contracts a multiplication and an addition, so all instruction sets give the same bits.
+//! never contracts a multiplication and an addition, so all instruction sets give the same bits. Integer sums are
+//! bounded by the largest whole factor; they are written as wrapping so that no check for overflow, where the build
+//! has those, keeps the loops from being vectorised.
 
 use multiversion::multiversion;
 
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
 pub(super) fn add(sums: &mut [u32], counts: &[u16]) {
     for (sum, count) in sums.iter_mut().zip(counts) {
-        *sum += u32::from(*count);
+        *sum = sum.wrapping_add(u32::from(*count));
     }
 }
 
@@ -61,9 +63,9 @@ fn cells_by(factor: usize, [top, bottom]: [&[u32]; 2], black_span: [f32; 2], pla
     for ((top, bottom), ((first, green), second)) in columns.zip(first.iter_mut().zip(green).zip(second)) {
         let mut sums = [0; 3];
         for i in 0..factor {
-            sums[0] += top[2 * i];
-            sums[1] += top[2 * i + 1] + bottom[2 * i];
-            sums[2] += bottom[2 * i + 1];
+            sums[0] = top[2 * i].wrapping_add(sums[0]);
+            sums[1] = top[2 * i + 1].wrapping_add(bottom[2 * i]).wrapping_add(sums[1]);
+            sums[2] = bottom[2 * i + 1].wrapping_add(sums[2]);
         }
         *first = linear(sums[0], outer_offset, outer_scale);
         *green = linear(sums[1], green_offset, green_scale);
@@ -82,7 +84,7 @@ pub(super) fn whole_mono(factor: usize, sums: &[u32], black_span: [f32; 2], plan
         return;
     }
     for (value, sums) in plane.iter_mut().zip(sums.chunks_exact(factor)) {
-        *value = linear(sums.iter().sum(), offset, scale);
+        *value = linear(sums.iter().fold(0, |sum, value| value.wrapping_add(sum)), offset, scale);
     }
 }
 
@@ -131,13 +133,13 @@ pub(super) fn mixed_mono(sums: &[f32], taps: &[[u32; 2]], weights: &[f32], span:
     }
 }
 
-/// The sum of all values, in eight fixed lanes.
+/// The sum of all values, in 32 fixed lanes.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
 pub(super) fn total(values: &[f32]) -> f64 {
-    let (blocks, rest) = values.as_chunks::<8>();
-    let mut lanes = [0.0f64; 8];
+    let (blocks, rest) = values.as_chunks::<32>();
+    let mut lanes = [0.0f64; 32];
     for block in blocks {
-        for i in 0..8 {
+        for i in 0..32 {
             lanes[i] += f64::from(block[i]);
         }
     }

@@ -1,0 +1,177 @@
+//! How long a frame takes to develop, beside the same steps in numpy and OpenCV: `cargo bench --bench exposure`.
+
+use std::{
+    hint::black_box,
+    path::{Path, PathBuf},
+    process::{Command, ExitCode},
+    time::{Duration, Instant},
+};
+
+use criterion::Criterion;
+use nightflow::{
+    camera::Frame,
+    clock::Stamp,
+    exposure::{Config, Developer, Packing},
+    wire::{Header, Image, Time},
+};
+
+const BLACK: u32 = 64;
+const WHITE: u32 = 4095;
+
+/// A count of the night scene that `rivals/develop.py` makes by the same formula: a chequered ground, noise, one lamp
+/// and some hot pixels.
+fn count(x: u32, y: u32, seed: u32) -> u16 {
+    let mut z = x.wrapping_mul(0x9e37_79b9) ^ y.wrapping_mul(0x85eb_ca6b) ^ seed.wrapping_mul(0xc2b2_ae35);
+    z = (z ^ (z >> 16)).wrapping_mul(0x7feb_352d);
+    z = (z ^ (z >> 15)).wrapping_mul(0x846c_a68b);
+    z ^= z >> 16;
+    let noise = (z & 15) + (z >> 4 & 15);
+    let ground = 20 + 60 * ((x / 64 + y / 64) % 2);
+    if (600..640).contains(&x) && (500..540).contains(&y) {
+        WHITE as u16
+    } else if x % 160 == 97 && y % 128 == 33 {
+        3000
+    } else {
+        (BLACK + ground + noise - 15) as u16
+    }
+}
+
+fn counts(width: u32, height: u32, seed: u32) -> Vec<u16> {
+    (0..height).flat_map(|y| (0..width).map(move |x| count(x, y, seed))).collect()
+}
+
+fn frame(encoding: &str, width: u32, height: u32, step: u32, seed: u32, bytes: Vec<u8>) -> Frame {
+    let stamp = Time { sec: seed as i32, nanosec: 0 };
+    let header = Header { stamp, frame_id: "camera".into() };
+    let image = Image { header, height, width, encoding: encoding.into(), is_bigendian: 0, step, data: bytes };
+    Frame { image, received: Stamp::default() }
+}
+
+fn wide(width: u32, height: u32, seed: u32) -> Frame {
+    let bytes = counts(width, height, seed).into_iter().flat_map(u16::to_le_bytes).collect();
+    frame("bayer_rggb16", width, height, 2 * width, seed, bytes)
+}
+
+fn packed(width: u32, height: u32, seed: u32) -> Frame {
+    let counts = counts(width, height, seed);
+    let (pairs, _) = counts.as_chunks::<2>();
+    let bytes =
+        pairs.iter().flat_map(|[a, b]| [(a >> 4) as u8, (b >> 4) as u8, (a & 15) as u8 | ((b & 15) as u8) << 4]);
+    frame("8UC1", width, height, width / 2 * 3, seed, bytes.collect())
+}
+
+fn bytes(width: u32, height: u32, seed: u32) -> Frame {
+    let bytes = counts(width, height, seed).into_iter().map(|count| (count >> 4) as u8).collect();
+    frame("bayer_rggb8", width, height, width, seed, bytes)
+}
+
+fn twelve_bits() -> Config {
+    Config { bit_depth: Some(12), black_level: Some(BLACK as f32), ..Config::default() }
+}
+
+/// What a drone would give: each frame differs from the one before.
+pub fn cases() -> Vec<(&'static str, Config, [Frame; 2])> {
+    let big_endian = [1, 2].map(|seed| {
+        let mut frame = wide(1280, 1024, seed);
+        frame.image.data.chunks_exact_mut(2).for_each(|pair| pair.swap(0, 1));
+        frame.image.is_bigendian = 1;
+        frame
+    });
+    let raw12 =
+        Config { packing: Some(Packing::Raw12), pattern: Some(nightflow::exposure::Pattern::Rggb), ..twelve_bits() };
+    let mixed = Config { width_max: 300, ..twelve_bits() };
+    let eight = Config { black_level: Some(4.0), ..Config::default() };
+    vec![
+        ("12 of 16 bits, by 4", twelve_bits(), [1, 2].map(|seed| wide(1280, 1024, seed))),
+        ("12 of 16 bits, big-endian", twelve_bits(), big_endian),
+        ("12 of 16 bits, by 4.27", mixed, [1, 2].map(|seed| wide(1280, 1024, seed))),
+        ("8 bits", eight, [1, 2].map(|seed| bytes(1280, 1024, seed))),
+        ("packed RAW12", raw12, [1, 2].map(|seed| packed(1280, 1024, seed))),
+        ("640x480, 12 of 16 bits, by 2", twelve_bits(), [1, 2].map(|seed| wide(640, 480, seed))),
+    ]
+}
+
+fn ours(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("develop 1280x1024");
+    for (name, config, frames) in cases() {
+        let mut developer = Developer::new(&config).expect("the settings are right");
+        let mut newest = frames.iter().cycle();
+        group.bench_function(name, |bencher| {
+            bencher.iter(|| {
+                developer.develop(newest.next().expect("a cycle has no end")).expect("the frame is right");
+                black_box(developer.pair().map(|pair| pair.newer.gain))
+            });
+        });
+    }
+    group.finish();
+}
+
+/// The median over one case in milliseconds, and the newest image.
+fn median(config: &Config, frames: &[Frame]) -> (f64, Vec<f32>) {
+    let mut developer = Developer::new(config).expect("the settings are right");
+    let mut times: Vec<Duration> = Vec::new();
+    for frame in frames.iter().cycle().take(400) {
+        let start = Instant::now();
+        developer.develop(frame).expect("the frame is right");
+        black_box(developer.pair().map(|pair| pair.newer.gain));
+        times.push(start.elapsed());
+    }
+    times.sort_unstable();
+    let newest = developer.newest().expect("a frame was developed");
+    (times[times.len() / 2].as_secs_f64() * 1e3, newest.rgb.clone())
+}
+
+/// A Python with what the rivals import, installed once under `target/rivals`.
+fn python() -> Result<PathBuf, String> {
+    let rivals = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/rivals");
+    let home = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/rivals");
+    let python = home.join("bin/python");
+    let run = |command: &mut Command| match command.status() {
+        Ok(status) if status.success() => Ok(()),
+        Ok(status) => Err(format!("{command:?} ended with {status}")),
+        Err(error) => Err(format!("{command:?}: {error}")),
+    };
+    if !python.is_file() {
+        run(Command::new("python3").args(["-m", "venv"]).arg(&home))?;
+    }
+    run(Command::new(&python).args(["-m", "pip", "install", "-q", "-r"]).arg(rivals.join("requirements.txt")))?;
+    Ok(python)
+}
+
+/// Runs the rival on the same frames, has it compare images, and prints both times.
+fn against_the_rival() -> Result<(), String> {
+    let (milliseconds, rgb) = median(&twelve_bits(), &[1, 2].map(|seed| wide(1280, 1024, seed)));
+    let image = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/rivals/developed.f32");
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/rivals/develop.py");
+    let python = python()?;
+    let bytes: Vec<u8> = rgb.iter().flat_map(|value| value.to_le_bytes()).collect();
+    std::fs::write(&image, bytes).map_err(|error| format!("{}: {error}", image.display()))?;
+    let output = Command::new(python).arg(script).arg(&image).output().map_err(|error| error.to_string())?;
+    let printed = String::from_utf8_lossy(&output.stdout);
+    if !output.status.success() {
+        return Err(format!("the rival failed:\n{printed}{}", String::from_utf8_lossy(&output.stderr)));
+    }
+    print!("{printed}");
+    let rival: f64 = printed
+        .lines()
+        .find_map(|line| line.strip_prefix("median_ms "))
+        .and_then(|value| value.trim().parse().ok())
+        .ok_or("the rival printed no median")?;
+    println!("develop 1280x1024 12 of 16 bits to 320x256, medians of 400 frames and of the rival's in the same run:");
+    println!(
+        "  nightflow {milliseconds:.3} ms, numpy + OpenCV {rival:.3} ms: {:.1} times faster",
+        rival / milliseconds
+    );
+    Ok(())
+}
+
+fn main() -> ExitCode {
+    let mut criterion = Criterion::default().configure_from_args();
+    ours(&mut criterion);
+    criterion.final_summary();
+    if let Err(reason) = against_the_rival() {
+        eprintln!("no comparison with numpy and OpenCV: {reason}");
+        return ExitCode::FAILURE;
+    }
+    ExitCode::SUCCESS
+}
