@@ -29,6 +29,8 @@ pub struct Config {
     pub threads: usize,
     /// What raster the flow is given on.
     pub resolution: Resolution,
+    /// Frames further apart than this are no pair.
+    pub gap_ms_max: f64,
     /// Run the network once at start and compare with the values that its exporter noted.
     pub golden_check: bool,
     /// Below this mean above black (1 = white) there is no trustworthy flow.
@@ -53,6 +55,7 @@ impl Default for Config {
             runtime: PathBuf::new(),
             threads: 2,
             resolution: Resolution::Quarter,
+            gap_ms_max: 150.0,
             golden_check: true,
             raw_mean_min: 0.001,
             raw_mean_degraded: 0.002,
@@ -80,6 +83,7 @@ pub const REASONS: &[(&str, &str)] = &[
         "resolution",
         "quarter: the network knows no more than that, and the samples of a finer raster are not independent",
     ),
+    ("gap_ms_max", "150: four lost frames at 30 Hz; beyond, a drone's motion leaves the reach of the cost volumes"),
     ("golden_check", "a runtime that computes something else is found at start, for the price of one small pair"),
     ("raw_mean_min", "0.001: half of the darkest raw mean that the network is trained for (0.002)"),
     ("raw_mean_degraded", "0.002: the darkest raw mean that the network is trained for"),

@@ -137,6 +137,21 @@ pub enum Lack {
     Degenerate,
 }
 
+impl Lack {
+    /// What is missing, without its figures: the name that steps are counted under.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Lack::Blind => "trustworthy flow",
+            Lack::Calibration => "a calibration",
+            Lack::CameraSize { .. } => "a calibration for this frame size",
+            Lack::Gyro => "a gyro",
+            Lack::GyroGap { .. } => "a gyro over the whole interval",
+            Lack::Disagreement { .. } => "flow vectors that agree",
+            Lack::Degenerate => "flow that determines the motion",
+        }
+    }
+}
+
 /// Why a sample or the settings were refused.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {

@@ -90,6 +90,16 @@ impl Default for Config {
     }
 }
 
+/// Why each default is what it is, by key.
+pub const REASONS: &[(&str, &str)] = &[
+    ("path", "absent: nothing is recorded unless a file is named"),
+    ("compression", "lz4: 300 MB/s on one core, twice what 1280×1024×16 bit at 60 Hz makes; zstd saves a third more"),
+    ("sync_s", "1: what a power cut can cost at most; a shorter interval makes smaller chunks and more of them"),
+    ("frames", "true: without the frames there is nothing to replay"),
+    ("flow", "true: at quarter resolution flow and confidence are a tenth of the frames"),
+    ("queue_max", "64: two seconds of frames at 30 Hz for a disk that stalls"),
+];
+
 /// How chunks are compressed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
