@@ -47,6 +47,7 @@ struct Inside {
     /// How many small samples go out without waiting for a frame, because none came in time.
     overdue: usize,
     counts: Counts,
+    numbers: Numbers,
     senders: usize,
     failure: Option<Error>,
 }
@@ -101,9 +102,10 @@ impl Sender {
         self.shared.lock().counts.torn += 1;
     }
 
-    /// Counts frames that their sender numbered and that never came.
-    pub fn missed(&self, frames: u64) {
-        self.shared.lock().counts.missed += frames;
+    /// Counts the frames that are missing before this number of a publisher's.
+    pub fn numbered(&self, publisher: [u8; 16], number: i64) {
+        let mut inside = self.shared.lock();
+        inside.counts.missed += inside.numbers.missed(publisher, number);
     }
 
     /// The transport is gone: once what waits is taken, the taker hears why.
@@ -113,28 +115,22 @@ impl Sender {
     }
 }
 
-/// Finds holes in the numbers that a publisher gives its messages.
-#[derive(Debug)]
-pub struct Numbers<P> {
-    last: Option<(P, i64)>,
+/// Finds holes in the numbers that a publisher gives its frames.
+#[derive(Default)]
+struct Numbers {
+    newest: Option<([u8; 16], i64)>,
 }
 
-impl<P> Default for Numbers<P> {
-    fn default() -> Self {
-        Self { last: None }
-    }
-}
-
-impl<P: PartialEq> Numbers<P> {
-    /// How many messages of this publisher are missing before this one; another publisher begins anew.
-    pub fn missed(&mut self, publisher: P, number: i64) -> u64 {
-        let (newest, missed) = match &self.last {
-            Some((known, last)) if *known == publisher => {
-                (number.max(*last), number.saturating_sub(*last).saturating_sub(1).max(0))
+impl Numbers {
+    /// How many frames of this publisher are missing before this one; another publisher begins anew.
+    fn missed(&mut self, publisher: [u8; 16], number: i64) -> u64 {
+        let (newest, missed) = match self.newest {
+            Some((known, newest)) if known == publisher => {
+                (number.max(newest), number.saturating_sub(newest).saturating_sub(1).max(0))
             }
             _ => (number, 0),
         };
-        self.last = Some((publisher, newest));
+        self.newest = Some((publisher, newest));
         missed.unsigned_abs()
     }
 }

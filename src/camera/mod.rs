@@ -3,6 +3,7 @@
 pub mod latest;
 pub mod mcap;
 pub mod ros2;
+pub mod zenoh;
 
 use std::{sync::Arc, time::Duration};
 
@@ -208,7 +209,7 @@ pub struct Mcap {
 pub fn open(config: &Config) -> Result<Box<dyn Source>, Error> {
     match &config.source {
         SourceConfig::Ros2(settings) => Ok(Box::new(ros2::Ros2Source::open(config, settings)?)),
-        SourceConfig::Zenoh(_) => Err(Error::Settings("zenoh is not built in".into())),
+        SourceConfig::Zenoh(settings) => Ok(Box::new(zenoh::ZenohSource::open(config, settings)?)),
         SourceConfig::Mcap(recording) => mcap::open(config, recording),
     }
 }

@@ -9,7 +9,7 @@ use futures::{
     stream,
 };
 use ros2_client::{
-    Gid, MessageInfo, MessageTypeName, Name, NodeName, NodeOptions, QosProfile, ReadError,
+    MessageInfo, MessageTypeName, Name, NodeName, NodeOptions, QosProfile, ReadError,
     dds::{Context, Node, Subscription},
     qos::{History, WhenFull},
 };
@@ -18,7 +18,7 @@ use serde::de::DeserializeOwned;
 
 use super::{
     Config, Counts, Error, Frame, Next, Ros2, Sample, Source,
-    latest::{Latest, Numbers, SMALL_ROOM, Sender, mailbox},
+    latest::{Latest, SMALL_ROOM, Sender, mailbox},
 };
 use crate::{
     clock,
@@ -168,9 +168,8 @@ async fn receive(mut node: Node, readers: Readers, sender: Sender, stopped: ones
         samples(&readers.imu, |imu| Sample::Imu(Arc::new(imu))),
         samples(&readers.range, |range| Sample::Range(Arc::new(range))),
     ]);
-    let mut numbers = Numbers::<Gid>::default();
     let delivering = received.take_until(stopped).for_each(|received| {
-        deliver(&sender, &mut numbers, received);
+        deliver(&sender, received);
         future::ready(())
     });
     // The spinner keeps the ROS graph; frames come without it too.
@@ -185,11 +184,11 @@ async fn receive(mut node: Node, readers: Readers, sender: Sender, stopped: ones
     }
 }
 
-fn deliver(sender: &Sender, numbers: &mut Numbers<Gid>, received: Received) {
+fn deliver(sender: &Sender, received: Received) {
     match received {
         Ok((sample, info)) => {
             if matches!(sample, Sample::Frame(_)) {
-                sender.missed(numbers.missed(info.publisher_gid(), info.sequence_number()));
+                sender.numbered(info.publisher_gid().to_bytes16(), info.sequence_number());
             }
             sender.put(sample);
         }

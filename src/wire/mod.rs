@@ -7,6 +7,7 @@ mod diagnostic;
 mod encoder;
 mod geometry;
 mod nightflow;
+pub mod rmw;
 mod sensor;
 mod standard;
 

@@ -9,3 +9,4 @@ mod peers;
 mod recording;
 mod ros2;
 mod wire;
+mod zenoh;

@@ -13,8 +13,8 @@ use nightflow::camera::{
 
 use crate::peers::{self, Peer};
 
-const LONG: Duration = Duration::from_secs(30);
-const SHORT: Duration = Duration::from_millis(20);
+pub const LONG: Duration = Duration::from_secs(30);
+pub const SHORT: Duration = Duration::from_millis(20);
 
 /// A DDS domain and a prefix of topics that no other test uses, of this run or of another on the same machine.
 pub fn place() -> (u16, String) {
@@ -53,7 +53,7 @@ fn start(config: &camera::Config, width: u32, height: u32) -> Peer {
 }
 
 /// The index that the camera wrote into the frame's last pixels.
-fn index(sample: &Sample) -> u64 {
+pub fn index(sample: &Sample) -> u64 {
     let Sample::Frame(frame) = sample else { panic!("not a frame: {sample:?}") };
     let image = &frame.image;
     assert_eq!((image.encoding.as_str(), image.step), ("bayer_rggb16", image.width * 2));
@@ -62,7 +62,7 @@ fn index(sample: &Sample) -> u64 {
 }
 
 /// Takes frames until none came for as long as `quiet`.
-fn take_all(source: &mut dyn Source, quiet: Duration) -> Vec<u64> {
+pub fn take_all(source: &mut dyn Source, quiet: Duration) -> Vec<u64> {
     let mut indices = vec![];
     let mut newest = Instant::now();
     while newest.elapsed() < quiet {
@@ -78,7 +78,7 @@ fn take_all(source: &mut dyn Source, quiet: Duration) -> Vec<u64> {
     indices
 }
 
-fn until(what: &str, mut done: impl FnMut() -> bool) {
+pub fn until(what: &str, mut done: impl FnMut() -> bool) {
     let start = Instant::now();
     while !done() {
         assert!(start.elapsed() < LONG, "not within {LONG:?}: {what}");
@@ -118,7 +118,7 @@ fn full_rate(width: u32, height: u32, hz: u64) {
 }
 
 /// Nothing is unaccounted for: taken, displaced, missed, or lost before the first or after the last one that arrived.
-fn account(indices: &[u64], counts: Counts, sent: u64) {
+pub fn account(indices: &[u64], counts: Counts, sent: u64) {
     let Counts { arrived, displaced, torn, missed, .. } = counts;
     eprintln!("of {sent}: arrived {arrived}, displaced {displaced}, missed {missed}, torn {torn}");
     assert!(indices.is_sorted_by(|a, b| a < b), "out of order: {indices:?}");
