@@ -1,6 +1,7 @@
 //! All integration tests in one binary.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
+mod allocations;
 mod exposure;
 mod flow;
 mod latest;

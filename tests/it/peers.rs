@@ -79,9 +79,14 @@ impl Peer {
 
     /// The next line that the script prints; fails the test when none comes in time.
     pub fn line(&mut self, within: Duration) -> String {
-        self.lines.recv_timeout(within).unwrap_or_else(|_| {
-            panic!("{} printed nothing within {within:?} (it ended: {:?})", self.script, self.child.try_wait())
-        })
+        match self.lines.recv_timeout(within) {
+            Ok(line) => line,
+            Err(mpsc::RecvTimeoutError::Timeout) => panic!("{} printed nothing within {within:?}", self.script),
+            Err(mpsc::RecvTimeoutError::Disconnected) => {
+                let status = self.wait(within);
+                panic!("{} ended with {status} where a line was awaited", self.script)
+            }
+        }
     }
 
     /// The next line that begins so, passing over others; fails the test when none comes in time.
