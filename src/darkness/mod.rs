@@ -1,3 +1,8 @@
 //! The laboratory of the paper: noise models, synthetic flights and darkness, and evaluation.
 
+pub mod flight;
 pub mod noise;
+mod path;
+pub mod profiles;
+mod scene;
+mod surface;

@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod allocations;
+mod darkness;
 mod exposure;
 mod flow;
 mod latest;
