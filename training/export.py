@@ -57,7 +57,9 @@ def with_half_weights(graph: onnx.ModelProto) -> onnx.ModelProto:
         if values.dtype == np.float32 and values.size > 1024:
             half = tensor.name + "_half"
             kept.append(onnx.numpy_helper.from_array(values.astype(np.float16), half))
-            casts.append(onnx.helper.make_node("Cast", [half], [tensor.name], to=onnx.TensorProto.FLOAT, name=half + "_cast"))
+            casts.append(
+                onnx.helper.make_node("Cast", [half], [tensor.name], to=onnx.TensorProto.FLOAT, name=half + "_cast")
+            )
         else:
             kept.append(tensor)
     nodes = casts + list(graph.graph.node)
@@ -193,7 +195,7 @@ def main() -> None:
         worst = parity(rounded(network), exported, *moved(height, width, height))
         print(f"{height}x{width}: graphs and PyTorch differ by at most {worst:.1e} px")
         if worst > PARITY_PX:
-            raise SystemExit(f"{height}x{width}: expected at most {PARITY_PX} px between the graphs and PyTorch, got {worst}")
+            raise SystemExit(f"{height}x{width}: expected graphs within {PARITY_PX} px of PyTorch, got {worst}")
     entry = manifest_entry(arguments.name, arguments.version, files, exported)
     write_manifest(arguments.models / "manifest.toml", arguments.name, entry)
 

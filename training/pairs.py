@@ -22,7 +22,8 @@ def linear(first: torch.Tensor, second: torch.Tensor, jitter: bool = True):
     # A little flicker of lamps; and a picture that is mostly black is not brought up without bound.
     flicker = 1 + (0.02 * torch.randn(batch) if jitter else torch.zeros(batch))
     gain = gain.clamp(max=8.0)
-    return (frames[0] * gain.view(-1, 1, 1, 1)).clamp(0, 1), (frames[1] * (gain * flicker).view(-1, 1, 1, 1)).clamp(0, 1)
+    gains = gain, gain * flicker
+    return tuple((frame * g.view(-1, 1, 1, 1)).clamp(0, 1) for frame, g in zip(frames, gains))
 
 
 def noisy(first: torch.Tensor, second: torch.Tensor, level: float | None = None):

@@ -6,6 +6,7 @@ mostly 0...8 px at 320x256.
 """
 
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,8 @@ def pack(photographs: Path, target: Path) -> None:
         pixels = np.asarray(image)
         height, width = pixels.shape[:2]
         wide = max(height, width) > 1.3 * SIDE
-        for y, x in {(0, 0), (height - SIDE, width - SIDE)} if wide else {((height - SIDE) // 2, (width - SIDE) // 2)}:
+        down, right = height - SIDE, width - SIDE
+        for y, x in [(0, 0), (down, right)] if wide else [(down // 2, right // 2)]:
             squares.append(pixels[y : y + SIDE, x : x + SIDE])
             owners.append(rank)
     np.savez(target, squares=np.stack(squares), owners=np.array(owners), names=[files[i].name for i in order])
@@ -135,7 +137,7 @@ class Surface:
 
 
 class Outline:
-    """A soft cut-out in frame-1 pixels: a wavy, stretched (down to thin rods) shape, now and then with a hole or bars."""
+    """A soft cut-out in frame-1 pixels: a wavy shape, some stretched to thin rods, some with a hole or bars."""
 
     def __init__(self, batch: int, height: int, width: int):
         self.x, self.y = uniform(batch, 0, width), uniform(batch, 0, height)
@@ -153,7 +155,10 @@ class Outline:
 
     def cover(self, points: torch.Tensor) -> torch.Tensor:
         """Opacity [B, 1, H, W] at frame-1 points."""
-        b = lambda v: v.view(-1, 1, 1)
+
+        def b(values):
+            return values.view(-1, 1, 1)
+
         dx, dy = points[:, 0] - b(self.x), points[:, 1] - b(self.y)
         c, s = b(torch.cos(self.turn)), b(torch.sin(self.turn))
         along, across = (c * dx + s * dy) / b(self.stretch), (c * dy - s * dx) * b(self.stretch)
@@ -193,3 +198,9 @@ def scene(textures: Textures, batch: int, height: int, width: int, shapes: int =
         second = torch.lerp(second, surface.colour(origin), cover_second)
         flow = torch.where(cover > 0.5, mapped(motion, points) - points, flow)
     return first, second, flow
+
+
+if __name__ == "__main__":
+    folder, packed = map(Path, sys.argv[1:])
+    packed.parent.mkdir(parents=True, exist_ok=True)
+    pack(folder, packed)

@@ -1,4 +1,4 @@
-"""Trains in legs: `train.py fcdn.toml --minutes 20 --resume` ends by itself with a checkpoint that goes on elsewhere."""
+"""Trains in legs: `train.py fcdn.toml --minutes 20 --resume` ends by itself with a checkpoint to go on from."""
 
 import argparse
 import copy
@@ -44,7 +44,8 @@ class Run:
             [
                 {"params": rest, "factor": 1.0, "weight_decay": description["weight_decay"]},
                 {"params": sharp, "factor": 10.0, "weight_decay": 0.0},
-            ]
+            ],
+            fused=True,
         )
         self.step, self.seconds = 0, 0.0
 
@@ -102,6 +103,8 @@ class Run:
         self.network.load_state_dict(state["network"])
         self.mean.load_state_dict(state["mean"])
         self.optimizer.load_state_dict(state["optimizer"])
+        for group in self.optimizer.param_groups:
+            group["fused"], group["foreach"] = True, None
         torch.set_rng_state(state["random"])
         self.step, self.seconds = state["step"], state["seconds"]
 
@@ -134,8 +137,8 @@ def leg(run: Run, folder: Path, packed: Path, minutes: float, every: float) -> N
     before = run.seconds
     while True:
         crop = run.crop()
-        losses.append(run.train_step(*batch_of(textures, crop["batch"], crop["height"], crop["width"],
-                                               clean=run.description["clean"])))
+        pairs = batch_of(textures, crop["batch"], crop["height"], crop["width"], clean=run.description["clean"])
+        losses.append(run.train_step(*pairs))
         run.seconds = before + time.monotonic() - began
         over = run.seconds - before >= 60 * minutes or run.progress() >= 1
         if over or run.seconds >= row_due:

@@ -1,0 +1,83 @@
+"""Export: graphs equal PyTorch at every size, and the committed files are what the manifest says."""
+
+import hashlib
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from export import (GOLDEN_COLUMNS, GOLDEN_ROWS, OPSET, Exported, golden_frames, graphs_of, manifest_entry, moved,
+                    parity, rounded, write_manifest)
+from networks import PwcNet
+
+MODELS = Path(__file__).parents[2] / "models"
+
+
+@pytest.fixture(scope="module")
+def fresh():
+    """An untrained network and its graphs."""
+    torch.manual_seed(0)
+    network = PwcNet().eval()
+    graphs = {part: graph.SerializeToString() for part, graph in graphs_of(network).items()}
+    return rounded(network), graphs, Exported(graphs["pyramid"], graphs["decoder"])
+
+
+@pytest.mark.parametrize("height, width", [(64, 64), (128, 192), (256, 320), (448, 640)])
+def test_graphs_equal_pytorch(fresh, height, width):
+    network, _, exported = fresh
+    assert parity(network, exported, *moved(height, width, 1)) < 1e-3
+    random = np.random.default_rng(0)
+    assert parity(network, exported, *(random.random((1, 3, height, width), np.float32) for _ in range(2))) < 1e-3
+
+
+def test_scale_multiplies_flow_but_not_the_expected_error(fresh):
+    exported = fresh[2]
+    pair = golden_frames()
+    (flow, error), (scaled, same) = exported(*pair), exported(*pair, scale=(2.0, 3.0))
+    np.testing.assert_allclose(scaled, flow * np.array([2, 3], np.float32), rtol=1e-5)
+    np.testing.assert_array_equal(error, same)
+    assert flow.shape == (1, 32, 48, 2) and error.shape == (1, 32, 48)
+
+
+def test_weights_are_stored_in_half_precision(fresh):
+    for graph in fresh[1].values():
+        model = onnx.load_from_string(graph)
+        assert model.opset_import[0].version == OPSET
+        large = [t for t in model.graph.initializer if np.prod(t.dims) > 1024]
+        assert large and all(t.data_type == onnx.TensorProto.FLOAT16 for t in large)
+
+
+def test_golden_frames_follow_their_formula():
+    older, newer = golden_frames()
+    c, y, x = 2, 50, 70
+    wanted = 0.4 + 0.25 * np.sin(0.20 * x + 0.13 * y + c) * np.cos(0.17 * y - 0.05 * x)
+    assert older[0, c, y, x] == np.float32(wanted)
+    np.testing.assert_allclose(newer[0, :, 1:, 2:], older[0, :, :-1, :-2], atol=1e-6)
+
+
+def test_the_manifest_keeps_other_networks(fresh, tmp_path):
+    files = {}
+    for part, graph in fresh[1].items():
+        files[part] = tmp_path / f"one_{part}.onnx"
+        files[part].write_bytes(graph)
+    for name in ("one", "two", "one"):
+        write_manifest(tmp_path / "manifest.toml", name, manifest_entry(name, "1", files, fresh[2]))
+    assert sorted(tomllib.loads((tmp_path / "manifest.toml").read_text())) == ["one", "two"]
+
+
+def test_committed_files_are_those_of_the_manifest():
+    manifest = tomllib.loads((MODELS / "manifest.toml").read_text())
+    assert manifest
+    for entry in manifest.values():
+        paths = [MODELS / entry[part]["file"] for part in ("pyramid", "decoder")]
+        for part, path in zip(("pyramid", "decoder"), paths):
+            assert hashlib.sha256(path.read_bytes()).hexdigest() == entry[part]["sha256"]
+            assert path.stat().st_size <= 20_000_000
+        outputs = Exported(*(str(path) for path in paths))(*golden_frames())
+        rows, columns = np.ix_(GOLDEN_ROWS, GOLDEN_COLUMNS)
+        for key, output in zip(("flow", "uncertainty"), outputs):
+            golden = np.array(entry["golden"][key])
+            assert np.abs(output[0][rows, columns].flatten() - golden).max() <= entry["golden"]["tolerance"]

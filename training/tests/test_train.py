@@ -1,0 +1,96 @@
+"""Training: a leg that is resumed equals one that went straight through, and the network does learn."""
+
+import pytest
+import torch
+
+from pairs import HeldOut, batch_of
+from scenes import Textures
+from train import Run, judged, leg
+
+DESCRIPTION = {
+    "seed": 1, "clean": False, "peak_rate": 6e-4, "warm_up_steps": 5, "weight_decay": 1e-4, "clip": 1.0,
+    "mean_decay": 0.9, "bf16": False, "schedule": {"steps": 6},
+    "crops": [
+        {"from": 0.0, "height": 64, "width": 64, "batch": 2},
+        {"from": 0.5, "height": 64, "width": 128, "batch": 1},
+    ],
+}
+
+
+@pytest.fixture
+def one_thread():
+    """Sums in one order, so that two runs can be equal to the bit."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def steps(run: Run, textures: Textures, count: int) -> None:
+    for _ in range(count):
+        crop = run.crop()
+        run.train_step(*batch_of(textures, crop["batch"], crop["height"], crop["width"]))
+
+
+def test_resumed_equals_straight_through(packed, tmp_path, one_thread):
+    textures = Textures(packed, held_out=False)
+    straight = Run(DESCRIPTION)
+    steps(straight, textures, 6)
+    first = Run(DESCRIPTION)
+    steps(first, textures, 3)
+    first.save(tmp_path / "checkpoint.pt")
+    torch.manual_seed(99)
+    second = Run(DESCRIPTION)
+    second.load(tmp_path / "checkpoint.pt")
+    steps(second, textures, 3)
+    assert second.step == straight.step == 6
+    for kind in ("network", "mean"):
+        wanted = getattr(straight, kind).state_dict()
+        for name, value in getattr(second, kind).state_dict().items():
+            assert torch.equal(value, wanted[name]), (kind, name)
+
+
+def test_the_schedule_warms_up_and_falls(packed):
+    run = Run(DESCRIPTION)
+    assert run.rate() == pytest.approx(6e-4 / 5)
+    run.step = 5
+    assert run.crop()["width"] == 128 and 6e-6 < run.rate() < 1e-4
+    run.step = 6
+    assert run.rate() == pytest.approx(6e-6)
+
+
+def test_minutes_make_a_schedule_too():
+    run = Run(DESCRIPTION | {"schedule": {"minutes": 2}})
+    run.seconds = 30.0
+    assert run.progress() == 0.25
+    run.seconds = 500.0
+    assert run.progress() == 1.0
+
+
+def test_a_leg_writes_its_log_and_a_checkpoint(packed, tmp_path):
+    run = Run(DESCRIPTION | {"schedule": {"steps": 2}})
+    leg(run, tmp_path, packed, minutes=10, every=10)
+    heading, row = (tmp_path / "log.csv").read_text().splitlines()
+    assert heading.startswith("step,minutes,loss") and row.startswith("2,")
+    assert len(row.split(",")) == len(heading.split(","))
+    again = Run(DESCRIPTION)
+    again.load(tmp_path / "checkpoint.pt")
+    assert again.step == 2
+
+
+def test_a_few_pairs_are_learned_by_heart(packed):
+    torch.manual_seed(4)
+    textures = Textures(packed, held_out=False)
+    pairs = batch_of(textures, 2, 64, 64, level=5)
+    run = Run(DESCRIPTION | {"peak_rate": 1e-3, "schedule": {"steps": 120}})
+    zero = pairs[2].norm(dim=1).mean().item()
+    for _ in range(90):
+        _, error = run.train_step(*pairs)
+    assert zero > 1.0 and error < 0.4 * zero, (zero, error)
+
+
+def test_judging_does_not_move_the_random_state(packed):
+    network, held = Run(DESCRIPTION).mean, HeldOut(packed, count=2, height=64, width=64)
+    before = torch.get_rng_state()
+    assert len(judged(network, held)) == 4
+    assert torch.equal(before, torch.get_rng_state())
