@@ -234,20 +234,25 @@ fn finish(flow: &[f32], uncertainty: &mut [f32]) -> Result<(), Error> {
 /// the newer frame.
 fn mask(pair: &Pair<'_>, grid: &Grid, flow: &[f32], confidence: &mut [f32]) {
     let (older, newer) = (pair.older, pair.newer);
-    let (width, height) = (older.width, older.height);
     // Developed pixels per cell: 4 or 1; a frame of less than 4 pixels is one cell.
     let side = (grid.scale[0] / older.scale[0]).round() as usize;
+    let per_pixel = older.scale.map(|scale| 1.0 / scale);
+    let edge = [older.width as f32, older.height as f32];
     let spots = older.saturated_part > 0.0 || newer.saturated_part > 0.0;
-    for (index, (vector, confidence)) in flow.chunks_exact(2).zip(confidence).enumerate() {
-        let (column, row) = (index % grid.width, index / grid.width);
-        let centre = |cell: usize| (cell as f32 + 0.5) * side as f32 - 0.5;
-        let x = (centre(column) + vector[0] / older.scale[0] + 0.5).floor();
-        let y = (centre(row) + vector[1] / older.scale[1] + 0.5).floor();
-        let inside = x >= 0.0 && y >= 0.0 && x < width as f32 && y < height as f32;
-        if !inside
-            || (spots && (covered(older, column, row, side) || newer.saturated[y as usize * width + x as usize] != 0))
-        {
-            *confidence = 0.0;
+    let rows = flow.chunks_exact(2 * grid.width).zip(confidence.chunks_exact_mut(grid.width));
+    for (row, (vectors, confidence)) in rows.enumerate() {
+        // Half a pixel on, so that a pixel's number is the whole part.
+        let y = (row as f32 + 0.5) * side as f32;
+        for (column, (vector, confidence)) in vectors.chunks_exact(2).zip(confidence).enumerate() {
+            let x = (column as f32 + 0.5) * side as f32;
+            let to = [x + vector[0] * per_pixel[0], y + vector[1] * per_pixel[1]];
+            let inside = to[0] >= 0.0 && to[1] >= 0.0 && to[0] < edge[0] && to[1] < edge[1];
+            let hidden = || {
+                covered(older, column, row, side) || newer.saturated[to[1] as usize * older.width + to[0] as usize] != 0
+            };
+            if !inside || (spots && hidden()) {
+                *confidence = 0.0;
+            }
         }
     }
 }

@@ -9,6 +9,7 @@ mod matcher;
 mod network;
 mod onnx;
 pub mod padding;
+mod provider;
 pub mod runtime;
 mod trust;
 pub mod wheel;

@@ -18,6 +18,7 @@ use crate::flow::{
     manifest::{self, Kind},
     network::{Golden, Model, Network, Raster, Slot},
     padding::Padded,
+    provider,
     runtime::{self, Tried},
 };
 
@@ -105,7 +106,7 @@ impl Graph {
             // Threads that spin for their next work between two frames would take the cores from the other stages.
             .with_config_entry("session.force_spinning_stop", "1")
             .map_err(failed(doing))?
-            .with_config_entry("session.record_ep_graph_assignment_info", "1")
+            .with_config_entry(provider::RECORD, "1")
             .map_err(failed(doing))?
             .commit_from_memory(bytes)
             .map_err(failed("load a graph"))?;
@@ -162,7 +163,11 @@ impl Onnx {
         let inputs = [levels("older_"), levels("newer_"), vec!["scale".into()]].concat();
         decoder.check(&entry.decoder.file, &inputs, &["flow".into(), "uncertainty".into()])?;
         let channels = channels(&entry.pyramid.file, &pyramid.session)?;
-        let provider = format!("CPUExecutionProvider of ONNX Runtime {}", version());
+        let mut assigned = provider::assigned(&pyramid.session).map_err(failed("name its providers"))?;
+        for (name, count) in provider::assigned(&decoder.session).map_err(failed("name its providers"))? {
+            *assigned.entry(name).or_insert(0) += count;
+        }
+        let provider = format!("{} of ONNX Runtime {}", provider::named(&assigned), provider::version(&library));
         let sha256 = [entry.pyramid, entry.decoder].into_iter().map(|file| (file.file, file.sha256)).collect();
         Ok(Self {
             pyramid,
@@ -278,11 +283,4 @@ fn bind(binding: &mut IoBinding, name: &str, memory: &mut [f32], shape: &[usize]
     let tensor: TensorRefMut<'_, f32> =
         unsafe { TensorRefMut::from_raw(MemoryInfo::default(), memory.as_mut_ptr().cast(), shape)? };
     binding.bind_output(name, tensor)
-}
-
-/// The loaded library's version, out of its build information.
-fn version() -> String {
-    let info = ort::info();
-    let branch = info.split("git-branch=").nth(1).and_then(|rest| rest.split(',').next());
-    branch.unwrap_or(info).trim_start_matches("rel-").to_string()
 }

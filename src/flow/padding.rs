@@ -92,18 +92,19 @@ pub fn enlarge(
     channels: usize,
 ) {
     let columns: Vec<_> = (0..width).map(|x| between(x, from_width)).collect();
+    let length = from_width * channels;
+    // A row between two rows of the raster, from which the columns are then taken.
+    let mut line = vec![0.0; length];
     for (y, target) in into.chunks_exact_mut(width * channels).enumerate() {
         let (upper, lower, down) = between(y, from_height);
-        let upper = &from[upper * from_width * channels..][..from_width * channels];
-        let lower = &from[lower * from_width * channels..][..from_width * channels];
+        let rows = from[upper * length..][..length].iter().zip(&from[lower * length..][..length]);
+        for (value, (a, b)) in line.iter_mut().zip(rows) {
+            *value = a + down * (b - a);
+        }
         for (cell, &(left, right, along)) in target.chunks_exact_mut(channels).zip(&columns) {
-            for (c, value) in cell.iter_mut().enumerate() {
-                let mix = |row: &[f32]| {
-                    let (a, b) = (row[left * channels + c], row[right * channels + c]);
-                    a + along * (b - a)
-                };
-                let (a, b) = (mix(upper), mix(lower));
-                *value = a + down * (b - a);
+            let (a, b) = (&line[left * channels..][..channels], &line[right * channels..][..channels]);
+            for ((value, a), b) in cell.iter_mut().zip(a).zip(b) {
+                *value = a + along * (b - a);
             }
         }
     }

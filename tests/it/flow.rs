@@ -1,6 +1,6 @@
 //! Flow: sizes, kept features, the real network through ONNX Runtime, and what is said when something is amiss.
 
-use std::{fs, path::Path};
+use std::{fs, path::Path, process::Command};
 
 use nightflow::{
     clock::Stamp,
@@ -240,7 +240,7 @@ fn the_committed_model_passes_its_golden_check() {
     assert!(deviation.worst <= deviation.tolerance);
     let model = matcher.model();
     assert_eq!(model.name, "pwcnet_fcdn");
-    assert!(model.provider.starts_with("CPUExecutionProvider"), "{model:?}");
+    assert_eq!(model.provider, format!("CPUExecutionProvider of ONNX Runtime {}", runtime::VERSION));
     assert_eq!(model.sha256.len(), 2);
     assert!(model.sha256.iter().all(|(file, hash)| file.ends_with(".onnx") && hash.len() == 64));
 }
@@ -376,6 +376,50 @@ fn a_missing_runtime_says_where_it_was_looked_for_and_what_to_install() {
       /nowhere/libonnxruntime.so ([flow] runtime): there is no such file
     To install it: pip install --no-deps --target /opt/onnxruntime onnxruntime==1.31.1, and set [flow] runtime or ORT_DYLIB_PATH to /opt/onnxruntime/onnxruntime/capi/libonnxruntime.so.1.31.1
     ");
+}
+
+/// What a process of its own says when this file is its runtime: a process loads one library only.
+fn refused_runtime(library: &Path) -> String {
+    let child = Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "flow::a_process_of_its_own_opens_the_network", "--nocapture"])
+        .env("ORT_DYLIB_PATH", library)
+        .output()
+        .unwrap();
+    let text = String::from_utf8_lossy(&child.stdout).into_owned();
+    assert!(child.status.success(), "an error, not a panic: {text} {}", String::from_utf8_lossy(&child.stderr));
+    text.replace(&library.display().to_string(), "LIBRARY")
+}
+
+/// With no variable set this opens the network like any other test; the next one runs it with strange libraries.
+#[test]
+fn a_process_of_its_own_opens_the_network() {
+    match Matcher::open(&Config::default()) {
+        Ok(matcher) => assert!(matcher.model().library.is_file()),
+        Err(error @ Error::Runtime { .. }) if std::env::var_os("ORT_DYLIB_PATH").is_some() => println!("{error}"),
+        Err(error) => panic!("{error}"),
+    }
+}
+
+#[test]
+fn an_old_or_strange_runtime_is_an_error_with_its_version() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = folder.path().join("text.so");
+    fs::write(&text, "no library").unwrap();
+    let said = refused_runtime(&text);
+    assert!(said.contains("LIBRARY (ORT_DYLIB_PATH): ") && said.contains("pip install"), "{said}");
+
+    let old = folder.path().join("old.so");
+    let source = folder.path().join("old.c");
+    let program = r#"
+        static const char *version(void) { return "1.18.0"; }
+        static struct { const void *(*api)(unsigned); const char *(*version)(void); } base = { 0, version };
+        const void *OrtGetApiBase(void) { return &base; }
+    "#;
+    fs::write(&source, program).unwrap();
+    let built = Command::new("cc").args(["-shared", "-fPIC", "-o"]).args([&old, &source]).status().unwrap();
+    assert!(built.success());
+    let said = refused_runtime(&old);
+    assert!(said.contains("expected version >= '1.24.x', but got '1.18.0'"), "{said}");
 }
 
 #[test]
