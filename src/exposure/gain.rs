@@ -9,6 +9,7 @@ pub(super) struct Law {
     band: f32,
     smoothing: f32,
     step_factor: f32,
+    gain_max: f32,
     /// A mean below this would ask for more than the largest gain.
     floor: f32,
     /// Smoothed mean and the gain that is held; none before the first frame.
@@ -24,6 +25,7 @@ impl Law {
             band: config.gain_band,
             smoothing: config.gain_smoothing,
             step_factor: config.gain_step_factor,
+            gain_max: config.gain_max,
             floor: config.mean_target / config.gain_max,
             held: None,
             stepped: false,
@@ -51,7 +53,8 @@ impl Law {
         let (older, newer) = (older.max(self.floor), newer.max(self.floor));
         let factor = newer / older;
         if factor > self.step_factor || factor * self.step_factor < 1.0 {
-            let gain = (self.target / (older * newer).sqrt()).min(2.0 * self.target / older.max(newer));
+            let gain =
+                (self.target / (older * newer).sqrt()).min(2.0 * self.target / older.max(newer)).min(self.gain_max);
             self.held = Some([newer, gain]);
             self.stepped = true;
             return (gain, Some(factor));
@@ -81,7 +84,7 @@ impl Law {
     }
 
     fn aim(&mut self, mean: f32) -> f32 {
-        let gain = self.target / mean;
+        let gain = (self.target / mean).min(self.gain_max);
         self.held = Some([mean, gain]);
         self.stepped = false;
         gain

@@ -6,7 +6,7 @@
 //!    Gaussian noise the mean absolute difference is 1.13 standard deviations.
 //! 2. It does so by more than twice the spread of those eight as well, for where noise grows with the signal.
 //! 3. It is alone: a lamp's image is wider than a pixel and lifts the pixels beside it, whatever their colour. Their
-//!    rise over their own neighbours must stay below an eighth of the pixel's, plus twice the noise.
+//!    rise over pixels of their own colour further away must stay below an eighth of the pixel's, plus twice the noise.
 //!
 //! Only counts as they came are looked at, never repaired ones, so that the order of repair does not matter.
 
@@ -105,15 +105,11 @@ fn judge(window: &Window, above: u16, noise: f32) -> Option<u16> {
     if count <= brightest + u32::from(above).max(2 * (brightest - darkest)) {
         return None;
     }
-    let rise = if stride == 1 {
-        brightest - median
-    } else {
-        let rows = window.brightest(&[(-1, 0), (1, 0)]);
-        let rows_beside = window.brightest(&[(-1, -2), (1, -2), (-1, 2), (1, 2)]);
-        let columns = window.brightest(&[(0, -1), (0, 1)]);
-        let columns_beside = window.brightest(&[(-2, -1), (2, -1), (-2, 1), (2, 1)]);
-        rows.saturating_sub(rows_beside).max(columns.saturating_sub(columns_beside))
-    };
+    let rows = window.brightest(&[(-1, 0), (1, 0)]);
+    let rows_beside = window.brightest(&[(-1, -2), (1, -2), (-1, 2), (1, 2)]);
+    let columns = window.brightest(&[(0, -1), (0, 1)]);
+    let columns_beside = window.brightest(&[(-2, -1), (2, -1), (-2, 1), (2, 1)]);
+    let rise = rows.saturating_sub(rows_beside).max(columns.saturating_sub(columns_beside));
     let alone = rise as f32 <= (count - brightest) as f32 / 8.0 + 2.0 * noise;
     alone.then_some(median as u16)
 }
