@@ -6,9 +6,13 @@ use serde::{
     forward_to_deserialize_any,
 };
 
-/// What is wrong with the bytes; `field` is the path from the message down.
+/// What is wrong with the bytes. Boxed, since every number that is read passes through a `Result` of it.
 #[derive(Debug)]
-pub(super) struct Fault {
+pub(super) struct Fault(pub Box<Report>);
+
+/// The words of a [`Fault`]; `field` is the path from the message down.
+#[derive(Debug)]
+pub(super) struct Report {
     pub field: String,
     pub expected: String,
     pub found: String,
@@ -16,21 +20,22 @@ pub(super) struct Fault {
 
 impl Fault {
     fn new(expected: impl Into<String>, found: impl Into<String>) -> Self {
-        Self { field: String::new(), expected: expected.into(), found: found.into() }
+        Self(Box::new(Report { field: String::new(), expected: expected.into(), found: found.into() }))
     }
 
     fn within(mut self, outer: &str) -> Self {
-        if !self.field.is_empty() {
-            self.field.insert(0, '.');
+        let field = &mut self.0.field;
+        if !field.is_empty() {
+            field.insert(0, '.');
         }
-        self.field.insert_str(0, outer);
+        field.insert_str(0, outer);
         self
     }
 }
 
 impl std::fmt::Display for Fault {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{}: expected {}, found {}", self.field, self.expected, self.found)
+        write!(f, "{}: expected {}, found {}", self.0.field, self.0.expected, self.0.found)
     }
 }
 
@@ -85,15 +90,17 @@ impl<'de> Decoder<'de> {
     }
 
     fn take(&mut self, length: usize, what: &str) -> Result<&'de [u8], Fault> {
-        let left = &self.body[self.at..];
-        let Some(taken) = left.get(..length) else {
-            return Err(Fault::new(
-                format!("{length} bytes of {what}"),
-                format!("{} bytes before the end at byte {}", left.len(), self.body.len() + 4),
-            ));
+        let Some(taken) = self.body[self.at..].get(..length) else {
+            return Err(self.torn(length, what));
         };
         self.at += length;
         Ok(taken)
+    }
+
+    #[cold]
+    fn torn(&self, length: usize, what: &str) -> Fault {
+        let found = format!("{} bytes before the end at byte {}", self.left(), self.body.len() + 4);
+        Fault::new(format!("{length} bytes of {what}"), found)
     }
 
     fn number<const N: usize>(&mut self, what: &str) -> Result<[u8; N], Fault> {
@@ -219,6 +226,16 @@ struct Elements<'a, 'de> {
     names: &'static [&'static str],
 }
 
+impl Elements<'_, '_> {
+    #[cold]
+    fn named(&self, fault: Fault) -> Fault {
+        match self.names.len().checked_sub(self.left + 1).and_then(|index| self.names.get(index)) {
+            Some(name) => fault.within(name),
+            None => fault,
+        }
+    }
+}
+
 impl<'de> SeqAccess<'de> for Elements<'_, 'de> {
     type Error = Fault;
 
@@ -226,12 +243,8 @@ impl<'de> SeqAccess<'de> for Elements<'_, 'de> {
         if self.left == 0 {
             return Ok(None);
         }
-        let name = self.names.len().checked_sub(self.left).and_then(|index| self.names.get(index));
         self.left -= 1;
-        seed.deserialize(&mut *self.decoder).map(Some).map_err(|fault| match name {
-            Some(name) => fault.within(name),
-            None => fault,
-        })
+        seed.deserialize(&mut *self.decoder).map(Some).map_err(|fault| self.named(fault))
     }
 
     /// What memory is set aside by: exact for doubles, and never more than the bytes that are left can bear out.

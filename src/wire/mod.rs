@@ -68,10 +68,10 @@ pub fn encode<M: Message>(message: &M, out: &mut Vec<u8>) -> Result<(), Error> {
 /// Reads a message from CDR (XCDR1, either byte order, with its header of 4 bytes). A length that the bytes do not bear
 /// out is an error before anything is allocated for it.
 pub fn decode<M: Message>(bytes: &[u8]) -> Result<M, Error> {
-    decoder::decode(bytes).map_err(|fault| Error::Cdr {
-        message: if fault.field.is_empty() { ros_name::<M>() } else { format!("{}, {}", ros_name::<M>(), fault.field) },
-        expected: fault.expected,
-        found: fault.found,
+    decoder::decode(bytes).map_err(|decoder::Fault(report)| {
+        let message = ros_name::<M>();
+        let message = if report.field.is_empty() { message } else { format!("{message}, {}", report.field) };
+        Error::Cdr { message, expected: report.expected, found: report.found }
     })
 }
 
