@@ -92,6 +92,45 @@ fn block_matching_finds_a_moved_scene_at_odd_sizes_and_on_both_rasters() {
     }
 }
 
+/// The plain way to pad: continue every row and column by walking to and fro, up to multiples of 64.
+fn continued(exposed: &Exposed) -> Exposed {
+    let walk = |length: usize, to: usize| -> Vec<usize> {
+        (0..length).chain((1..length - 1).rev()).cycle().take(to).collect()
+    };
+    let (width, height) = (exposed.width.next_multiple_of(64), exposed.height.next_multiple_of(64));
+    let (columns, rows) = (walk(exposed.width, width), walk(exposed.height, height));
+    let mut rgb = Vec::new();
+    for plane in exposed.rgb.chunks(exposed.width * exposed.height) {
+        for row in &rows {
+            rgb.extend(columns.iter().map(|column| plane[row * exposed.width + column]));
+        }
+    }
+    Exposed { width, height, rgb, saturated: vec![0; width * height], ..exposed.clone() }
+}
+
+/// At any size a step gives what the network gives for images that were padded by hand, cut to the frame.
+fn padding_changes_nothing(mut matcher: Matcher, sizes: &[(usize, usize)]) {
+    for &(width, height) in sizes {
+        let (older, newer) = (frame(width, height, (0.0, 0.0), 1), frame(width, height, (2.0, 1.0), 2));
+        let (mut cut, mut whole) = (Own::default(), Own::default());
+        let cut = matcher.between(&pair(&older, &newer), &mut cut).unwrap();
+        let (older, newer) = (continued(&older), continued(&newer));
+        let whole = matcher.between(&pair(&older, &newer), &mut whole).unwrap();
+        assert_eq!((cut.grid.width, cut.grid.height), (width / 4, height / 4));
+        for row in 0..cut.grid.height {
+            let line = |flow: &Flow| flow.vectors[2 * row * flow.grid.width..][..2 * cut.grid.width].to_vec();
+            assert_eq!(line(&cut), line(&whole), "{width}x{height}, row {row}");
+        }
+    }
+}
+
+#[test]
+fn an_odd_size_gives_what_padding_by_hand_gives() {
+    let fake = Matcher::with(&Config::default(), Box::new(Fake::matching(3)));
+    padding_changes_nothing(fake, &[(100, 60), (65, 127), (37, 41), (130, 64)]);
+    padding_changes_nothing(real(), &[(100, 60), (70, 129)]);
+}
+
 #[test]
 fn the_full_raster_is_the_quarter_raster_between_its_cells() {
     let (older, newer) = (frame(128, 128, (0.0, 0.0), 1), frame(128, 128, (1.5, 0.5), 2));
@@ -240,7 +279,7 @@ fn the_committed_model_passes_its_golden_check() {
     assert!(deviation.worst <= deviation.tolerance);
     let model = matcher.model();
     assert_eq!(model.name, "pwcnet_fcdn");
-    assert_eq!(model.provider, format!("CPUExecutionProvider of ONNX Runtime {}", runtime::VERSION));
+    assert!(model.provider.starts_with("CPUExecutionProvider of ONNX Runtime 1."), "{model:?}");
     assert_eq!(model.sha256.len(), 2);
     assert!(model.sha256.iter().all(|(file, hash)| file.ends_with(".onnx") && hash.len() == 64));
 }
