@@ -91,9 +91,11 @@ impl Config {
 
 /// The reasons of all stages, with the section that they belong to.
 const REASONS: &[(&str, &[(&str, &str)])] = &[
+    ("camera", camera::REASONS),
     ("exposure", exposure::REASONS),
     ("flow", flow::REASONS),
     ("motion", motion::REASONS),
+    ("publish", publish::REASONS),
     ("recording", recording::REASONS),
 ];
 

@@ -151,6 +151,24 @@ impl Default for Config {
     }
 }
 
+/// Why each default is what it is, by key.
+pub const REASONS: &[(&str, &str)] = &[
+    ("image_topic", "the name that image drivers of ROS 2 use"),
+    ("info_topic", "beside the images, as camera drivers put it"),
+    ("imu_topic", "REP 145: what the sensor measured, with no orientation mixed in"),
+    ("range_topic", "no convention exists; set it to the range finder's"),
+    ("silence_s_max", "1: thirty frames of a 30 Hz camera, and soon enough for a pilot"),
+    ("source.ros2.domain", "0: what ROS_DOMAIN_ID is where nobody set it"),
+    ("source.ros2.reliable", "false: a frame that has to be sent again comes too late"),
+    ("source.ros2.receive_buffer_bytes", "0: all that the kernel allows, for a frame comes as hundreds of datagrams at once"),
+    ("source.zenoh.connect", "where the router of rmw_zenoh listens on this machine"),
+    ("source.zenoh.listen", "none: a free port of this machine only, as rmw_zenoh's nodes do"),
+    ("source.zenoh.rmw", "true: the camera is a ROS 2 node with rmw_zenoh; false for plain zenoh programs"),
+    ("source.zenoh.domain", "0: what ROS_DOMAIN_ID is where nobody set it"),
+    ("source.mcap.path", "none: a recording has to be named"),
+    ("source.mcap.realtime", "false: every frame is looked at, at the machine's own pace"),
+];
+
 /// The kinds of source.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -211,5 +229,38 @@ pub fn open(config: &Config) -> Result<Box<dyn Source>, Error> {
         SourceConfig::Ros2(settings) => Ok(Box::new(ros2::Ros2Source::open(config, settings)?)),
         SourceConfig::Zenoh(settings) => Ok(Box::new(zenoh::ZenohSource::open(config, settings)?)),
         SourceConfig::Mcap(recording) => mcap::open(config, recording),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn every_key_of_every_source_has_a_reason_and_no_reason_is_left_over() {
+        let sources = [
+            SourceConfig::Ros2(Ros2::default()),
+            SourceConfig::Zenoh(Zenoh::default()),
+            SourceConfig::Mcap(Mcap::default()),
+        ];
+        let mut keys = BTreeSet::new();
+        for source in sources {
+            let table = toml::Table::try_from(Config { source, ..Config::default() }).unwrap();
+            list(&mut keys, "", &table);
+        }
+        let reasons: BTreeSet<String> =
+            REASONS.iter().map(|(key, _)| (*key).to_owned()).collect();
+        assert_eq!(keys, reasons);
+    }
+
+    fn list(keys: &mut BTreeSet<String>, under: &str, table: &toml::Table) {
+        for (key, value) in table {
+            match value {
+                toml::Value::Table(inner) => list(keys, &format!("{under}{key}."), inner),
+                _ => drop(keys.insert(format!("{under}{key}"))),
+            }
+        }
     }
 }

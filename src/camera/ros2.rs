@@ -9,8 +9,8 @@ use futures::{
     stream,
 };
 use ros2_client::{
-    MessageInfo, MessageTypeName, Name, NodeName, NodeOptions, QosProfile, ReadError,
-    dds::{Context, Node, Subscription},
+    CreateResult, MessageInfo, MessageTypeName, Name, NodeName, NodeOptions, QosProfile, ReadError,
+    dds::{Context, Node, Spinner, Subscription},
     qos::{History, WhenFull},
 };
 use rustdds::{DomainParticipantBuilder, Topic};
@@ -116,6 +116,17 @@ pub(crate) fn topic<M: Message>(node: &Node, name: &str, qos: &QosProfile) -> Re
     node.create_topic(&parsed, MessageTypeName::new(M::PACKAGE, M::NAME), qos).map_err(|e| format!("{name}: {e}"))
 }
 
+/// Keeps the node in the ROS graph until it is dropped.
+pub(crate) async fn spin(spinner: CreateResult<Spinner>) {
+    let ended = match spinner {
+        Ok(spinner) => spinner.spin().await.map_err(|e| e.to_string()),
+        Err(e) => Err(e.to_string()),
+    };
+    if let Err(reason) = ended {
+        tracing::warn!("this node is not kept in the ROS graph: {reason}");
+    }
+}
+
 fn receive_buffer(settings: &Ros2) -> usize {
     let granted = receive_buffer_max().unwrap_or(RECEIVE_BUFFER_WANTED);
     let wanted = if settings.receive_buffer_bytes == 0 { granted } else { settings.receive_buffer_bytes };
@@ -154,13 +165,7 @@ fn samples<'a, M: Message + DeserializeOwned>(
 
 /// Every reader is read until it is empty: its history setting does not keep it from serving old frames.
 async fn receive(mut node: Node, readers: Readers, sender: Sender, stopped: oneshot::Receiver<()>) {
-    let spinner = node.spinner();
-    let spinning = async {
-        match spinner {
-            Ok(spinner) => spinner.spin().await.map_err(|e| e.to_string()),
-            Err(e) => Err(e.to_string()),
-        }
-    };
+    let spinning = spin(node.spinner());
     let frame = |image| Sample::Frame(Arc::new(Frame { image, received: clock::now() }));
     let received = stream::select_all([
         samples(&readers.image, frame),
@@ -174,12 +179,7 @@ async fn receive(mut node: Node, readers: Readers, sender: Sender, stopped: ones
     });
     // The spinner keeps the ROS graph; frames come without it too.
     match future::select(Box::pin(spinning), Box::pin(delivering)).await {
-        Either::Left((ended, delivering)) => {
-            if let Err(reason) = ended {
-                tracing::warn!("this node is not kept in the ROS graph: {reason}");
-            }
-            delivering.await;
-        }
+        Either::Left(((), delivering)) => delivering.await,
         Either::Right(_) => {}
     }
 }

@@ -1,9 +1,12 @@
 //! Stage 5: flow and velocity go out, to this machine's memory, to ROS 2 and to zenoh.
 
+mod courier;
 pub mod outgoing;
 
 pub mod pictures;
 mod plot;
+pub mod ros2;
+pub mod zenoh;
 
 use serde::{Deserialize, Serialize};
 
@@ -174,6 +177,21 @@ impl Default for Config {
     }
 }
 
+/// Why each default is what it is, by key.
+pub const REASONS: &[(&str, &str)] = &[
+    ("namespace", "the node's own name, as ROS 2 programs have it"),
+    ("body_frame", "REP 105: the vehicle's own frame"),
+    ("image_hz_max", "2: enough to watch; whoever needs every flow reads shared memory or the recording"),
+    ("iceoryx2.prefix", "the same name as the topics'"),
+    ("iceoryx2.subscribers_max", "4: each reader may hold samples, and their memory is set aside at the start"),
+    ("iceoryx2.cells_max", "640×480: fits the 64 MB of /dev/shm that a container has"),
+    ("ros2.domain", "0: what ROS_DOMAIN_ID is where nobody set it"),
+    ("zenoh.connect", "where the router of rmw_zenoh listens on this machine"),
+    ("zenoh.listen", "none: a free port of this machine only, as rmw_zenoh's nodes do"),
+    ("zenoh.rmw", "true: the readers are ROS 2 nodes with rmw_zenoh; false for plain zenoh programs"),
+    ("zenoh.domain", "0: what ROS_DOMAIN_ID is where nobody set it"),
+];
+
 /// `[publish.iceoryx2]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -217,5 +235,25 @@ pub struct Zenoh {
 impl Default for Zenoh {
     fn default() -> Self {
         Self { connect: vec!["tcp/localhost:7447".into()], listen: vec![], rmw: true, domain: 0 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn every_key_of_every_sink_has_a_reason_and_no_reason_is_left_over() {
+        let all = Config { ros2: Some(Ros2::default()), zenoh: Some(Zenoh::default()), ..Config::default() };
+        let mut keys = BTreeSet::new();
+        for (key, value) in toml::Table::try_from(all).unwrap() {
+            match value {
+                toml::Value::Table(inner) => keys.extend(inner.keys().map(|name| format!("{key}.{name}"))),
+                _ => drop(keys.insert(key)),
+            }
+        }
+        assert_eq!(keys, REASONS.iter().map(|(key, _)| (*key).to_owned()).collect());
     }
 }

@@ -9,6 +9,7 @@ mod latest;
 mod motion;
 mod peers;
 mod recording;
+mod results;
 mod ros2;
 mod wire;
 mod zenoh;

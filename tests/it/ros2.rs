@@ -6,12 +6,18 @@ use std::{
     time::{Duration, Instant},
 };
 
-use nightflow::camera::{
-    self, Counts, Next, Sample, Source, SourceConfig,
-    ros2::{RECEIVE_BUFFER_WANTED, receive_buffer_advice, receive_buffer_max},
+use nightflow::{
+    camera::{
+        self, Counts, Next, Sample, Source, SourceConfig,
+        ros2::{RECEIVE_BUFFER_WANTED, receive_buffer_advice, receive_buffer_max},
+    },
+    publish::{self, ros2::Ros2Sink},
 };
 
-use crate::peers::{self, Peer};
+use crate::{
+    peers::{self, Peer},
+    results,
+};
 
 pub const LONG: Duration = Duration::from_secs(30);
 pub const SHORT: Duration = Duration::from_millis(20);
@@ -234,4 +240,14 @@ fn a_name_that_is_no_topic_is_refused() {
     let config = camera::Config { image_topic: "/camera//raw frames".into(), ..config(domain, &prefix) };
     let Err(why) = camera::open(&config) else { panic!("it was opened") };
     assert!(why.to_string().contains("/camera//raw frames"), "{why}");
+}
+
+#[test]
+fn cyclonedds_reads_every_result() {
+    let (domain, namespace) = place();
+    let mut sink = Ros2Sink::open(&results::config(&namespace), &publish::Ros2 { domain }).unwrap();
+    let mut reader = peers::spawn("dds_results.py", [domain.to_string(), namespace]);
+    reader.line_starting("listening", LONG);
+    results::send_until_read(&mut sink, &mut reader);
+    reader.finish(LONG);
 }

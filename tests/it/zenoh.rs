@@ -4,11 +4,13 @@ use std::{net::TcpListener, thread, time::Duration};
 
 use nightflow::{
     camera::{self, Counts, Next, Sample, Source, SourceConfig},
+    publish::{self, zenoh::ZenohSink},
     wire,
 };
 
 use crate::{
     peers::{self, Peer},
+    results,
     ros2::{LONG, SHORT, account, check_sensors, index, place, take_all, until},
 };
 
@@ -160,4 +162,27 @@ fn a_source_that_is_there_first_finds_cameras_that_come_and_die() {
         camera.kill();
         take_all(source.as_mut(), Duration::from_millis(200));
     }
+}
+
+fn results_are_read(style: &str) {
+    let endpoint = endpoint();
+    let (domain, namespace) = place();
+    let settings = publish::Zenoh { connect: vec![], listen: vec![endpoint.clone()], rmw: style == "rmw", domain };
+    let mut sink = ZenohSink::open(&results::config(&namespace), &settings).unwrap();
+    let msgs = concat!(env!("CARGO_MANIFEST_DIR"), "/msgs");
+    let args = [&endpoint, style, &domain.to_string(), &namespace, msgs];
+    let mut reader = peers::spawn("zenoh_results.py", args);
+    reader.line_starting("listening", LONG);
+    results::send_until_read(&mut sink, &mut reader);
+    reader.finish(LONG);
+}
+
+#[test]
+fn eclipse_zenoh_reads_every_result_under_plain_keys() {
+    results_are_read("plain");
+}
+
+#[test]
+fn eclipse_zenoh_reads_every_result_as_rmw_zenoh_would() {
+    results_are_read("rmw");
 }
