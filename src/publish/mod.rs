@@ -1,11 +1,12 @@
 //! Stage 5: flow and velocity go out, to this machine's memory, to ROS 2 and to zenoh.
 
 mod courier;
+pub mod iceoryx2;
 pub mod outgoing;
-
 pub mod pictures;
 mod plot;
 pub mod ros2;
+pub mod shared;
 pub mod zenoh;
 
 use serde::{Deserialize, Serialize};
@@ -132,17 +133,15 @@ pub enum Error {
     },
     /// There is too little shared memory.
     #[error(
-        "/dev/shm has {free} bytes free, {needed} bytes are needed for flow of {width}×{height}; enlarge it or lower [flow] or [publish.iceoryx2] limits"
+        "/dev/shm has {free} bytes free, {needed} are needed for flow of {cells} cells; enlarge it (docker: --shm-size) or lower cells_max or subscribers_max in [publish.iceoryx2]"
     )]
     SharedMemory {
         /// Bytes free.
         free: u64,
         /// Bytes needed.
         needed: u64,
-        /// Columns.
-        width: usize,
-        /// Rows.
-        height: usize,
+        /// Cells of the largest flow that must fit.
+        cells: usize,
     },
 }
 

@@ -1,0 +1,558 @@
+//! Shared memory on this machine: the network writes flow where its readers read it.
+
+use std::fmt::Debug;
+
+use ::iceoryx2::{
+    node::{Node, NodeBuilder},
+    port::{LoanError, notifier::Notifier, publisher::Publisher},
+    prelude::{
+        AllocationStrategy, EventId, LogLevel, ServiceName, SignalHandlingMode, ZeroCopySend, set_log_level_from_env_or,
+    },
+    sample_mut::SampleMut,
+    service::ipc_threadsafe::Service,
+};
+
+use super::{
+    Config, Error, Iceoryx2, Moved, Offer, Sink,
+    shared::{FlowHeader, StatusSample, VelocitySample},
+};
+use crate::{
+    clock,
+    flow::{Canvas, Grid, Lender, Own},
+    wire,
+};
+
+/// Samples that wait for a reader; the older gives way.
+const BUFFER: usize = 2;
+/// Samples that one reader may hold.
+const BORROWED: usize = 2;
+/// What a reader gets at once when it comes.
+const HISTORY: usize = 1;
+/// Beside the payload, a sample holds iceoryx2's header, ours, and what aligning them costs.
+const SAMPLE_EXTRA: usize = 256;
+/// Services, connections, queues and the small samples: measured as 0.1 MB with four readers of flow and confidence.
+const FIXED_BYTES: u64 = 1 << 20;
+
+/// The event that follows a step; a status follows with [`STATUS_EVENT`].
+pub const STEP_EVENT: usize = 0;
+/// The event that follows a status.
+pub const STATUS_EVENT: usize = 1;
+
+type Loan = SampleMut<Service, [f32], FlowHeader>;
+type Floats = Publisher<Service, [f32], FlowHeader>;
+
+/// Names the four services under a prefix: `<prefix>/flow` and so on.
+pub fn service_name(prefix: &str, name: &str) -> Result<ServiceName, Error> {
+    let full = format!("{}/{name}", prefix.trim_end_matches('/'));
+    ServiceName::new(&full).map_err(|e| refused(format!("{full:?} can't be the name of a service: {e:?}")))
+}
+
+/// How many samples the flow's memory must hold. All readers wait for the same [`BUFFER`] newest samples, and each may
+/// hold [`BORROWED`] older ones; one is being written. iceoryx2 itself counts the waiting ones for each reader anew.
+fn samples(subscribers: usize) -> usize {
+    subscribers * BORROWED + BUFFER.max(HISTORY) + 1
+}
+
+/// Bytes of shared memory that flow and confidence of `cells` cells ask for.
+pub fn bytes_needed(cells: usize, subscribers: usize) -> u64 {
+    let flow = cells * 2 * size_of::<f32>() + SAMPLE_EXTRA;
+    let confidence = cells * size_of::<f32>() + SAMPLE_EXTRA;
+    ((flow + confidence) * samples(subscribers)) as u64 + FIXED_BYTES
+}
+
+/// The sink, which also lends its memory to the network.
+///
+/// [`Lender::lend`] loans one sample for the flow and one for the confidence; [`SharedSink::send`] fills in their
+/// headers and hands exactly that memory to the readers. When readers hold every sample, or the flow has more cells
+/// than there is room for, memory of our own is lent instead: the step goes on, and its sending is lost and counted.
+pub struct SharedSink {
+    // Ports before the node that they live in: they are dropped in this order.
+    lent: Option<(Loan, Loan)>,
+    own: Own,
+    refusal: Option<String>,
+    flow: Floats,
+    confidence: Floats,
+    velocity: Publisher<Service, VelocitySample, ()>,
+    status: Publisher<Service, StatusSample, ()>,
+    wake: Notifier<Service>,
+    _node: Node<Service>,
+    cells_max: usize,
+    displaced: u64,
+    lost: u64,
+    copied: u64,
+}
+
+impl SharedSink {
+    /// Opens the services, cleaning up what a killed predecessor left, and checks first that the memory is there: too
+    /// little of it would end the program with SIGBUS in the middle of a step.
+    pub fn open(_config: &Config, settings: &Iceoryx2) -> Result<Self, Error> {
+        set_log_level_from_env_or(LogLevel::Error);
+        Self::open_on(NodeBuilder::new(), settings, samples(settings.subscribers_max), free_bytes)
+    }
+
+    fn open_on(
+        node: NodeBuilder,
+        settings: &Iceoryx2,
+        samples: usize,
+        free: impl FnOnce() -> Option<u64>,
+    ) -> Result<Self, Error> {
+        // Creating a node frees what dead nodes left behind, so the room is asked for after it.
+        let node = node
+            .signal_handling_mode(SignalHandlingMode::Disabled)
+            .create::<Service>()
+            .map_err(|e| refused(format!("{e:?}")))?;
+        let needed = bytes_needed(settings.cells_max, settings.subscribers_max);
+        if let Some(free) = free().filter(|free| *free < needed) {
+            return Err(Error::SharedMemory { free, needed, cells: settings.cells_max });
+        }
+        let floats = |name: &str, length: usize| floats(&node, settings, name, length, samples);
+        let flow = floats("flow", settings.cells_max * 2)?;
+        let confidence = floats("confidence", settings.cells_max)?;
+        let velocity = plain::<VelocitySample>(&node, settings, "velocity")?;
+        let status = plain::<StatusSample>(&node, settings, "status")?;
+        let wake = node
+            .service_builder(&service_name(&settings.prefix, "flow")?)
+            .event()
+            .open_or_create()
+            .map_err(|e| unopened(settings, "flow (event)", &e))?
+            .notifier_builder()
+            .default_event_id(EventId::new(STEP_EVENT))
+            .create()
+            .map_err(|e| unopened(settings, "flow (event)", &e))?;
+        Ok(Self {
+            lent: None,
+            own: Own::default(),
+            refusal: None,
+            flow,
+            confidence,
+            velocity,
+            status,
+            wake,
+            _node: node,
+            cells_max: settings.cells_max,
+            displaced: 0,
+            lost: 0,
+            copied: 0,
+        })
+    }
+
+    /// This sink as the one who lends memory for a step's flow.
+    pub fn lender(&mut self) -> &mut dyn Lender {
+        self
+    }
+
+    /// Tells how many frames were displaced so far; the header carries it.
+    pub fn displaced(&mut self, frames: u64) {
+        self.displaced = frames;
+    }
+
+    /// Steps whose vectors had to be copied, because they did not lie in lent memory.
+    pub fn copied(&self) -> u64 {
+        self.copied
+    }
+
+    /// Sends what was last lent, with the step's header, and its velocity.
+    pub fn send(&mut self, moved: &Moved) -> Result<(), Error> {
+        let Some((mut flow, mut confidence)) = self.lent.take() else {
+            let reason = self.refusal.take().unwrap_or_else(|| "nothing was lent".into());
+            return self.without_flow(moved, reason);
+        };
+        if flow.payload().len() != moved.grid.cells() * 2 {
+            let (lent, cells) = (flow.payload().len() / 2, moved.grid.cells());
+            return self.without_flow(moved, format!("{lent} cells were lent, the flow has {cells}"));
+        }
+        let header = self.header(moved);
+        *flow.user_header_mut() = header;
+        *confidence.user_header_mut() = header;
+        let sent = confidence.send().and_then(|_| flow.send());
+        if let Err(error) = sent {
+            return self.without_flow(moved, format!("{error:?}"));
+        }
+        self.send_velocity(moved, header.published_ns)?;
+        self.wake(STEP_EVENT);
+        Ok(())
+    }
+
+    /// A step whose vectors can't be sent still tells its velocity.
+    fn without_flow(&mut self, moved: &Moved, reason: String) -> Result<(), Error> {
+        self.lost += 1;
+        self.send_velocity(moved, clock::now().ns())?;
+        self.wake(STEP_EVENT);
+        Err(Error::Lost { sink: "iceoryx2", what: format!("the flow of step {}", moved.step), reason })
+    }
+
+    fn header(&self, moved: &Moved) -> FlowHeader {
+        FlowHeader {
+            published_ns: clock::now().ns(),
+            displaced: self.displaced,
+            lost: self.lost,
+            ..FlowHeader::from(moved)
+        }
+    }
+
+    fn send_velocity(&mut self, moved: &Moved, published_ns: i64) -> Result<(), Error> {
+        let sample = VelocitySample { published_ns, ..VelocitySample::from(moved) };
+        self.velocity.send_copy(sample).map(|_| ()).map_err(|e| Error::Lost {
+            sink: "iceoryx2",
+            what: format!("the velocity of step {}", moved.step),
+            reason: format!("{e:?}"),
+        })
+    }
+
+    /// Wakes whoever waits. A reader that can't be woken finds the sample when it looks.
+    fn wake(&self, event: usize) {
+        let _ = self.wake.notify_with_custom_event_id(EventId::new(event));
+    }
+
+    fn loan(&mut self, grid: &Grid) -> Result<(Loan, Loan), String> {
+        let cells = grid.cells();
+        if cells > self.cells_max {
+            return Err(format!(
+                "flow of {}×{} has {cells} cells, [publish.iceoryx2] cells_max allows {}",
+                grid.width, grid.height, self.cells_max
+            ));
+        }
+        let loan = |publisher: &Floats, length: usize| {
+            let sample = publisher.loan_slice_uninit(length).map_err(|error| match error {
+                LoanError::OutOfMemory | LoanError::ExceedsMaxLoans => "readers hold every sample".to_owned(),
+                other => format!("{other:?}"),
+            })?;
+            // SAFETY: the memory came zeroed from the kernel and has held nothing but f32 since, and every pattern of
+            // bits is an f32; it is lent to be written in full, and a part that is not shows an older step's values.
+            Ok::<Loan, String>(unsafe { sample.assume_init() })
+        };
+        Ok((loan(&self.flow, cells * 2)?, loan(&self.confidence, cells)?))
+    }
+
+    /// Whether the offered vectors lie in the memory that was lent.
+    fn holds(&self, offer: &Offer<'_>) -> bool {
+        let (flow, confidence) = self.lent();
+        std::ptr::eq(flow, offer.flow.vectors) && std::ptr::eq(confidence, offer.flow.confidence)
+    }
+}
+
+impl Lender for SharedSink {
+    fn lend(&mut self, grid: &Grid) -> Canvas<'_> {
+        let fits = self.lent.as_ref().is_some_and(|(flow, _)| flow.payload().len() == grid.cells() * 2);
+        if !fits {
+            // What was lent and not sent goes back first, or there would be no room for the next.
+            self.lent = None;
+            self.refusal = None;
+            match self.loan(grid) {
+                Ok(loans) => self.lent = Some(loans),
+                Err(reason) => self.refusal = Some(reason),
+            }
+        }
+        match &mut self.lent {
+            Some((flow, confidence)) => Canvas { flow: flow.payload_mut(), confidence: confidence.payload_mut() },
+            None => self.own.lend(grid),
+        }
+    }
+
+    fn lent(&self) -> (&[f32], &[f32]) {
+        match &self.lent {
+            Some((flow, confidence)) => (flow.payload(), confidence.payload()),
+            None => self.own.lent(),
+        }
+    }
+}
+
+impl Sink for SharedSink {
+    fn name(&self) -> &'static str {
+        "iceoryx2"
+    }
+
+    /// Sends the offer. Vectors that lie elsewhere than in lent memory are copied, once.
+    fn offer(&mut self, offer: &Offer<'_>) -> Result<(), Error> {
+        if self.lent.is_none() || !self.holds(offer) {
+            let canvas = self.lend(&offer.moved.grid);
+            if canvas.flow.len() == offer.flow.vectors.len() && canvas.confidence.len() == offer.flow.confidence.len() {
+                canvas.flow.copy_from_slice(offer.flow.vectors);
+                canvas.confidence.copy_from_slice(offer.flow.confidence);
+            }
+            self.copied += u64::from(self.lent.is_some());
+        }
+        self.send(offer.moved)
+    }
+
+    fn status(&mut self, status: &wire::Status) -> Result<(), Error> {
+        self.displaced = status.displaced;
+        let sent = self.status.send_copy(StatusSample::from(status));
+        self.wake(STATUS_EVENT);
+        sent.map(|_| ()).map_err(|e| Error::Lost {
+            sink: "iceoryx2",
+            what: "a status".into(),
+            reason: format!("{e:?}"),
+        })
+    }
+
+    fn lost(&self) -> u64 {
+        self.lost
+    }
+}
+
+fn floats(
+    node: &Node<Service>,
+    settings: &Iceoryx2,
+    name: &str,
+    length: usize,
+    samples: usize,
+) -> Result<Floats, Error> {
+    node.service_builder(&service_name(&settings.prefix, name)?)
+        .publish_subscribe::<[f32]>()
+        .user_header::<FlowHeader>()
+        // No payload_alignment here: iceoryx2 0.10 gives every element of a slice that alignment, 16 times the memory.
+        .enable_safe_overflow(true)
+        .subscriber_max_buffer_size(BUFFER)
+        .subscriber_max_borrowed_samples(BORROWED)
+        .history_size(HISTORY)
+        .max_publishers(1)
+        .max_subscribers(settings.subscribers_max)
+        .open_or_create()
+        .map_err(|e| unopened(settings, name, &e))?
+        .publisher_builder()
+        .allocation_strategy(AllocationStrategy::Static)
+        .initial_max_slice_len(length.max(1))
+        .max_loaned_samples(1)
+        .override_sample_preallocation(move |_| samples)
+        .create()
+        .map_err(|e| unopened(settings, name, &e))
+}
+
+fn plain<T: Debug + ZeroCopySend + Copy + 'static>(
+    node: &Node<Service>,
+    settings: &Iceoryx2,
+    name: &str,
+) -> Result<Publisher<Service, T, ()>, Error> {
+    node.service_builder(&service_name(&settings.prefix, name)?)
+        .publish_subscribe::<T>()
+        .enable_safe_overflow(true)
+        .subscriber_max_buffer_size(16)
+        .subscriber_max_borrowed_samples(BORROWED)
+        .history_size(HISTORY)
+        .max_publishers(1)
+        .max_subscribers(settings.subscribers_max)
+        .open_or_create()
+        .map_err(|e| unopened(settings, name, &e))?
+        .publisher_builder()
+        .create()
+        .map_err(|e| unopened(settings, name, &e))
+}
+
+fn refused(reason: String) -> Error {
+    Error::Open { sink: "iceoryx2", reason }
+}
+
+/// Says what usually stands behind an error of iceoryx2.
+fn unopened(settings: &Iceoryx2, name: &str, error: &dyn Debug) -> Error {
+    let (error, prefix) = (format!("{error:?}"), &settings.prefix);
+    let remedy = if error.contains("ExceedsMaxSupportedPublishers") {
+        "another node publishes there; stop it or give this one another prefix"
+    } else if error.contains("Incompatible") || error.contains("DoesNotSupport") || error.contains("VersionMismatch") {
+        "it exists with other settings, from another version or another subscribers_max; stop its readers and try again"
+    } else if error.contains("Permission") {
+        "it belongs to another user"
+    } else if error.contains("UnableToCreateDataSegment") {
+        "its memory could not be made; look at the room in /dev/shm"
+    } else {
+        "see the log of iceoryx2"
+    };
+    refused(format!("service {prefix}/{name}: {error}: {remedy}"))
+}
+
+/// Bytes free in /dev/shm; `None` where there is none to ask.
+fn free_bytes() -> Option<u64> {
+    // SAFETY: a statvfs is plain numbers, for which zeros are valid.
+    let mut room: libc::statvfs = unsafe { std::mem::zeroed() };
+    // SAFETY: the path ends in NUL and the struct outlives the call.
+    let answer = unsafe { libc::statvfs(c"/dev/shm".as_ptr(), &raw mut room) };
+    (answer == 0).then(|| room.f_bavail as u64 * room.f_frsize as u64)
+}
+
+#[cfg(test)]
+mod tests {
+    use ::iceoryx2::{config::Config as Iceoryx, port::subscriber::Subscriber};
+
+    use super::*;
+    use crate::{
+        clock::Stamp,
+        exposure::Exposed,
+        flow::{Cause, Flow, State},
+        motion::Lack,
+    };
+
+    const GRID: Grid = Grid { width: 8, height: 4, scale: [4.0, 4.0] };
+
+    fn settings(name: &str) -> Iceoryx2 {
+        Iceoryx2 {
+            prefix: format!("nightflow_test/{name}/{}", std::process::id()),
+            subscribers_max: 2,
+            cells_max: GRID.cells(),
+        }
+    }
+
+    fn moved(step: u64, grid: Grid) -> Moved {
+        Moved {
+            step,
+            older: Stamp::from_ns(1),
+            newer: Stamp::from_ns(2),
+            frame_id: "camera".into(),
+            camera_size: [32, 16],
+            grid,
+            gain: 2.0,
+            raw_mean: 0.1,
+            saturated_part: 0.0,
+            confidence: 0.5,
+            state: State::Blind(Cause::Frozen),
+            velocity: Err(Lack::Blind),
+        }
+    }
+
+    fn subscriber(node: &Node<Service>, settings: &Iceoryx2, name: &str) -> Subscriber<Service, [f32], FlowHeader> {
+        let service = node.service_builder(&service_name(&settings.prefix, name).unwrap());
+        let service = service.publish_subscribe::<[f32]>().user_header::<FlowHeader>().open().unwrap();
+        service.subscriber_builder().create().unwrap()
+    }
+
+    fn node() -> Node<Service> {
+        NodeBuilder::new().signal_handling_mode(SignalHandlingMode::Disabled).create().unwrap()
+    }
+
+    /// Lends, writes `step` into every cell and sends.
+    fn step(sink: &mut SharedSink, step: u64) -> Result<(), Error> {
+        let canvas = sink.lender().lend(&GRID);
+        canvas.flow.fill(step as f32);
+        canvas.confidence.fill(0.5);
+        sink.send(&moved(step, GRID))
+    }
+
+    #[test]
+    fn the_very_memory_that_was_lent_is_sent() {
+        let settings = settings("zero_copy");
+        let mut sink = SharedSink::open(&Config::default(), &settings).unwrap();
+        let node = node();
+        let (flow, confidence) = (subscriber(&node, &settings, "flow"), subscriber(&node, &settings, "confidence"));
+
+        let canvas = sink.lender().lend(&GRID);
+        let (at, beside) = (canvas.flow.as_ptr(), canvas.confidence.as_ptr());
+        canvas.flow.iter_mut().enumerate().for_each(|(i, value)| *value = i as f32);
+        canvas.confidence.fill(0.25);
+        let loan = sink.lent.as_ref().unwrap();
+        assert_eq!(
+            (loan.0.payload().as_ptr(), loan.1.payload().as_ptr()),
+            (at, beside),
+            "the network writes into loans"
+        );
+        assert_eq!((sink.lent().0.as_ptr(), sink.lent().1.as_ptr()), (at, beside), "the other sinks read from them");
+
+        // Another writes through the same address after the sink was asked for it: what arrives shows that nothing of
+        // it was copied before.
+        let canvas = sink.lender().lend(&GRID);
+        assert_eq!(canvas.flow.as_ptr(), at, "what was not sent is lent again");
+        canvas.flow[3] = -1.0;
+        sink.displaced(9);
+        sink.send(&moved(5, GRID)).unwrap();
+        let (got, sure) = (flow.receive().unwrap().unwrap(), confidence.receive().unwrap().unwrap());
+        let expected: Vec<f32> = (0..64).map(|i| if i == 3 { -1.0 } else { i as f32 }).collect();
+        assert_eq!(got.payload(), expected);
+        assert_eq!(sure.payload(), [0.25; 32]);
+        assert_eq!(got.user_header(), sure.user_header());
+        let header = *got.user_header();
+        assert_eq!((header.step, header.state, header.cause, header.displaced), (5, 2, 5, 9));
+        assert_eq!((header.width, header.height, header.camera_width, header.scale_x), (8, 4, 32, 4.0));
+        assert!(header.published_ns > 0);
+        assert_eq!((sink.copied(), sink.lost()), (0, 0));
+    }
+
+    #[test]
+    fn an_offer_out_of_other_memory_is_copied_once() {
+        let settings = settings("copied");
+        let mut sink = SharedSink::open(&Config::default(), &settings).unwrap();
+        let node = node();
+        let flow = subscriber(&node, &settings, "flow");
+        let moved = moved(1, GRID);
+        let (vectors, confidence) = ([1.5; 64], [0.5; 32]);
+        let of =
+            Flow { older: moved.older, newer: moved.newer, grid: GRID, vectors: &vectors, confidence: &confidence };
+        sink.offer(&Offer { moved: &moved, flow: of, image: &Exposed::default() }).unwrap();
+        assert_eq!(flow.receive().unwrap().unwrap().payload(), vectors);
+        assert_eq!(sink.copied(), 1);
+    }
+
+    #[test]
+    fn when_readers_hold_everything_the_step_goes_on_and_is_counted() {
+        let settings = settings("held");
+        // Less memory than its readers may hold between them.
+        let mut sink = SharedSink::open_on(NodeBuilder::new(), &settings, 3, || None).unwrap();
+        let node = node();
+        let reader = subscriber(&node, &settings, "flow");
+        let mut held = Vec::new();
+        for k in 0..2 {
+            step(&mut sink, k).unwrap();
+            held.extend(reader.receive().unwrap());
+        }
+        assert_eq!(held.len(), 2);
+        step(&mut sink, 2).unwrap();
+        let refused = step(&mut sink, 3).unwrap_err().to_string();
+        assert_eq!(refused, "iceoryx2 lost the flow of step 3: readers hold every sample");
+        assert_eq!(sink.lent().0, [3.0; 64], "memory of our own was lent instead");
+        assert_eq!(sink.lost(), 1);
+        drop(held);
+        step(&mut sink, 4).unwrap();
+        let newest = std::iter::from_fn(|| reader.receive().unwrap()).last().unwrap();
+        assert_eq!((newest.payload()[0], newest.user_header().lost), (4.0, 1));
+    }
+
+    #[test]
+    fn a_flow_above_the_limit_is_refused_with_both_numbers() {
+        let mut sink = SharedSink::open(&Config::default(), &settings("large")).unwrap();
+        let grid = Grid { width: 9, height: 4, ..GRID };
+        assert_eq!(sink.lender().lend(&grid).flow.len(), 72, "the network can write all the same");
+        let said = sink.send(&moved(0, grid)).unwrap_err().to_string();
+        assert!(said.contains("flow of 9×4 has 36 cells, [publish.iceoryx2] cells_max allows 32"), "{said}");
+    }
+
+    #[test]
+    fn too_little_shared_memory_is_said_before_anything_is_sent() {
+        let settings = Iceoryx2 { cells_max: 640 * 480, ..settings("small") };
+        let said = SharedSink::open_on(NodeBuilder::new(), &settings, 1, || Some(1 << 20)).map(|_| ()).unwrap_err();
+        let needed = bytes_needed(640 * 480, 2);
+        assert!(said.to_string().contains(&format!("1048576 bytes free, {needed} are needed")), "{said}");
+    }
+
+    #[test]
+    fn full_flow_of_vga_fits_into_the_memory_of_a_container() {
+        let defaults = Iceoryx2::default();
+        assert_eq!((defaults.cells_max, defaults.subscribers_max), (640 * 480, 4));
+        assert!(bytes_needed(640 * 480, 4) <= 64 << 20, "{} bytes", bytes_needed(640 * 480, 4));
+
+        // What iceoryx2 really makes, told from all else by a prefix of its own.
+        let mut config = Iceoryx::default();
+        let prefix = format!("nf{}_", std::process::id());
+        config.global.prefix = prefix.as_str().try_into().unwrap();
+        let settings = Iceoryx2 { prefix: settings("measured").prefix, ..defaults };
+        let mut sink =
+            SharedSink::open_on(NodeBuilder::new().config(&config), &settings, samples(4), free_bytes).unwrap();
+        let node: Node<Service> = NodeBuilder::new().config(&config).create().unwrap();
+        let readers: Vec<_> =
+            (0..4).flat_map(|_| ["flow", "confidence"].map(|name| subscriber(&node, &settings, name))).collect();
+        step(&mut sink, 0).unwrap();
+        let made: u64 = std::fs::read_dir("/dev/shm")
+            .unwrap()
+            .flatten()
+            .filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix))
+            .map(|entry| entry.metadata().unwrap().len())
+            .sum();
+        let needed = bytes_needed(640 * 480, 4);
+        assert!(made > 40_000_000 && made <= needed, "{made} bytes made, {needed} promised");
+        assert!(readers.iter().all(|reader| reader.receive().unwrap().is_some()));
+    }
+
+    #[test]
+    fn a_second_node_under_the_same_name_is_refused() {
+        let settings = settings("twice");
+        let _first = SharedSink::open(&Config::default(), &settings).unwrap();
+        let said = SharedSink::open(&Config::default(), &settings).map(|_| ()).unwrap_err().to_string();
+        assert!(said.contains("another node publishes there"), "{said}");
+    }
+}
