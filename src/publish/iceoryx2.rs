@@ -4,7 +4,7 @@ use std::fmt::Debug;
 
 use ::iceoryx2::{
     node::{Node, NodeBuilder},
-    port::{LoanError, notifier::Notifier, publisher::Publisher},
+    port::{LoanError, notifier::Notifier, publisher::Publisher, update_connections::UpdateConnections},
     prelude::{
         AllocationStrategy, EventId, LogLevel, ServiceName, SignalHandlingMode, ZeroCopySend, set_log_level_from_env_or,
     },
@@ -151,34 +151,32 @@ impl SharedSink {
         self.copied
     }
 
-    /// Sends what was last lent, with the step's header, and its velocity.
+    /// Sends what was last lent, with the step's header, and its velocity. The flow goes last, so that a reader who has
+    /// it finds all else of the step there; a step whose vectors can't be sent still tells its velocity.
     pub fn send(&mut self, moved: &Moved) -> Result<(), Error> {
-        let Some((mut flow, mut confidence)) = self.lent.take() else {
-            let reason = self.refusal.take().unwrap_or_else(|| "nothing was lent".into());
-            return self.without_flow(moved, reason);
-        };
-        if flow.payload().len() != moved.grid.cells() * 2 {
-            let (lent, cells) = (flow.payload().len() / 2, moved.grid.cells());
-            return self.without_flow(moved, format!("{lent} cells were lent, the flow has {cells}"));
-        }
         let header = self.header(moved);
-        *flow.user_header_mut() = header;
-        *confidence.user_header_mut() = header;
-        let sent = confidence.send().and_then(|_| flow.send());
-        if let Err(error) = sent {
-            return self.without_flow(moved, format!("{error:?}"));
-        }
-        self.send_velocity(moved, header.published_ns)?;
+        let told = self.send_velocity(moved, header.published_ns);
+        let sent = self.send_lent(moved, &header).map_err(|reason| {
+            self.lost += 1;
+            Error::Lost { sink: "iceoryx2", what: format!("the flow of step {}", moved.step), reason }
+        });
+        // Who comes late gets the newest status without waiting for the next one.
+        let _ = self.status.update_connections();
         self.wake(STEP_EVENT);
-        Ok(())
+        sent.and(told)
     }
 
-    /// A step whose vectors can't be sent still tells its velocity.
-    fn without_flow(&mut self, moved: &Moved, reason: String) -> Result<(), Error> {
-        self.lost += 1;
-        self.send_velocity(moved, clock::now().ns())?;
-        self.wake(STEP_EVENT);
-        Err(Error::Lost { sink: "iceoryx2", what: format!("the flow of step {}", moved.step), reason })
+    fn send_lent(&mut self, moved: &Moved, header: &FlowHeader) -> Result<(), String> {
+        let Some((mut flow, mut confidence)) = self.lent.take() else {
+            return Err(self.refusal.take().unwrap_or_else(|| "nothing was lent".into()));
+        };
+        let (lent, cells) = (flow.payload().len() / 2, moved.grid.cells());
+        if lent != cells {
+            return Err(format!("{lent} cells were lent, the flow has {cells}"));
+        }
+        *flow.user_header_mut() = *header;
+        *confidence.user_header_mut() = *header;
+        confidence.send().and_then(|_| flow.send()).map(|_| ()).map_err(|error| format!("{error:?}"))
     }
 
     fn header(&self, moved: &Moved) -> FlowHeader {

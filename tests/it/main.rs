@@ -5,6 +5,7 @@ mod allocations;
 mod darkness;
 mod exposure;
 mod flow;
+mod iceoryx2;
 mod latest;
 mod motion;
 mod peers;

@@ -1,6 +1,14 @@
 //! Recordings: written, read by the field's own readers, torn, repaired and compared.
 
-use std::{collections::BTreeMap, fs, io::Cursor, path::Path, sync::Arc, time::Duration};
+use std::{
+    collections::BTreeMap,
+    fs,
+    io::{BufRead, BufReader, Cursor},
+    path::Path,
+    process::{Command, Stdio},
+    sync::Arc,
+    time::Duration,
+};
 
 use nightflow::{
     camera::{
@@ -70,7 +78,7 @@ fn range() -> Arc<Range> {
 }
 
 /// What a step found between frames `step` and `step + 1`, with a velocity unless it is blind.
-fn moved(step: u64, state: State) -> Moved {
+pub fn moved(step: u64, state: State) -> Moved {
     let at = |k: u64| Stamp::from_ns(START_NS + k as i64 * 33_333_333);
     let (older, newer) = (at(step), at(step + 1));
     let velocity = Velocity {
@@ -110,7 +118,7 @@ fn offer(sink: &mut dyn Sink, moved: &Moved, shift: f32) {
     sink.offer(&Offer { moved, flow, image: &Exposed::default() }).unwrap();
 }
 
-fn dark() -> State {
+pub fn dark() -> State {
     State::Blind(Cause::Dark { raw_mean: 0.0001, needed: 0.001 })
 }
 
@@ -492,4 +500,138 @@ fn a_check_names_the_first_value_that_differs() {
     last.remove(index);
     let said = check::compare(last.into_iter(), outputs()).unwrap_err().to_string();
     assert!(said.contains("/nightflow/velocity") && said.contains("none was recorded"), "{said}");
+}
+
+#[test]
+fn what_the_disk_is_too_slow_for_is_counted_and_leaves_a_hole() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("slow.mcap");
+    let config = Config { path: Some(path.clone()), compression: Compression::Zstd, queue_max: 1, ..Config::default() };
+    let mut recorder =
+        Recorder::open(&config, &camera::Config::default(), "/nightflow", "base_link", &settings()).unwrap();
+    // Compressing a frame takes far longer than offering it.
+    let frames: Vec<_> = (0..24).map(|k| Sample::Frame(frame(k, 640, 480))).collect();
+    let mut refused = Vec::new();
+    for frame in &frames {
+        refused.extend(recorder.sample(frame).err());
+    }
+    recorder.finish().unwrap();
+    let lost = recorder.lost();
+    assert_eq!(refused.len() as u64, lost);
+    let said = refused[0].to_string();
+    assert!(said.starts_with("recording lost the frame of 17000000") && said.ends_with("1 wait for it"), "{said}");
+    let sequences: Vec<(u32, u64)> =
+        Messages::open(&path).unwrap().map(|message| (message.sequence, message.publish_time)).collect();
+    assert_eq!(sequences.len() as u64 + lost, 24);
+    for (sequence, time) in sequences {
+        assert_eq!(
+            Stamp::from_ns(time as i64),
+            frames[sequence as usize].stamp(),
+            "the numbers count the lost ones too"
+        );
+    }
+}
+
+const RECORD: &str = "NIGHTFLOW_TEST_RECORD";
+const KILLED_SIZE: (u32, u32) = (64, 48);
+
+/// What is recorded until the kill, item by item.
+fn sequence() -> impl Iterator<Item = Result<Sample, u64>> {
+    let (width, height) = KILLED_SIZE;
+    let opening = [Ok(Sample::Info(info())), Ok(Sample::Range(range()))];
+    opening.into_iter().chain((0..).flat_map(move |k| {
+        let step = (k > 0).then(|| Err(u64::from(k) - 1));
+        [Ok(Sample::Imu(imu(k))), Ok(Sample::Frame(frame(k, width, height)))].into_iter().chain(step)
+    }))
+}
+
+/// Records for the test below in a process of its own, which prints what is safe; with no file given it is no test.
+#[test]
+fn in_another_process() {
+    let Ok(role) = std::env::var(RECORD) else { return };
+    let (compression, path) = role.split_once(' ').unwrap();
+    let compression = match compression {
+        "none" => Compression::None,
+        "lz4" => Compression::Lz4,
+        _ => Compression::Zstd,
+    };
+    let config = Config { path: Some(path.into()), compression, sync_s: 0.02, queue_max: 1000, ..Config::default() };
+    let mut recorder =
+        Recorder::open(&config, &camera::Config::default(), "/nightflow", "base_link", &settings()).unwrap();
+    let mut told = 0;
+    for item in sequence() {
+        match item {
+            Ok(sample) => recorder.sample(&sample).unwrap(),
+            Err(step) => offer(&mut recorder, &moved(step, State::Ok), 0.0),
+        }
+        let synced = recorder.synced();
+        if synced > told {
+            println!("synced {synced}");
+            told = synced;
+        }
+        std::thread::sleep(Duration::from_micros(300));
+    }
+}
+
+/// Starts a recording, kills it `after` its first sync and gives the number of items that it called safe.
+fn kill_while_recording(path: &Path, compression: &str, after: Duration) -> usize {
+    let mut child = Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "recording::in_another_process", "--nocapture"])
+        .env(RECORD, format!("{compression} {}", path.display()))
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines().map_while(Result::ok);
+    let synced = |line: String| line.strip_prefix("synced ").map(|count| count.parse::<usize>().unwrap());
+    let first = lines.by_ref().find_map(synced).expect("a first sync is told");
+    std::thread::sleep(after);
+    child.kill().unwrap();
+    child.wait().unwrap();
+    lines.filter_map(synced).last().unwrap_or(first)
+}
+
+#[test]
+fn twenty_kills_cost_at_most_the_last_interval() {
+    let folder = tempfile::tempdir().unwrap();
+    // Seeded: the same moments in every run.
+    let mut seed = 0x6e69_6768_7466_6c77_u64;
+    let mut torn = 0;
+    for round in 0..20 {
+        seed ^= seed << 13;
+        seed ^= seed >> 7;
+        seed ^= seed << 17;
+        let path = folder.path().join(format!("{round}.mcap"));
+        let compression = ["none", "lz4", "zstd"][round % 3];
+        let safe = kill_while_recording(&path, compression, Duration::from_micros(seed % 200_000));
+
+        let repaired = repair(&path, Original::Keep).unwrap();
+        torn += usize::from(repaired.tear.is_some());
+        assert!(repair(&repaired.path, Original::Keep).unwrap().tear.is_none(), "what was repaired is whole");
+        // Every item up to the last sync is there, and whatever else is there goes on from it.
+        let expected: Vec<_> = sequence().take(safe).collect();
+        let wanted: Vec<Sample> = expected.iter().filter_map(|item| item.clone().ok()).collect();
+        let samples = read(&repaired.path, &camera::Config::default());
+        assert!(
+            samples.len() >= wanted.len(),
+            "round {round}: {} samples of {} that were safe",
+            samples.len(),
+            wanted.len()
+        );
+        let all: Vec<Sample> = sequence().filter_map(Result::ok).take(samples.len()).collect();
+        assert!(samples == all, "round {round}: the samples are not those that were recorded");
+        let steps: Vec<Stamp> = Outputs::open(&repaired.path, "/nightflow")
+            .unwrap()
+            .filter(|output| output.topic == "/nightflow/step")
+            .map(|output| output.stamp)
+            .collect();
+        let wanted = expected.iter().filter(|item| item.is_err()).count();
+        assert!(steps.len() >= wanted, "round {round}: {} steps of {wanted}", steps.len());
+        assert!(steps.iter().enumerate().all(|(step, stamp)| *stamp == moved(step as u64, State::Ok).newer));
+        assert_eq!(recording::metadata(&repaired.path, "nightflow").unwrap(), Some(settings()));
+        if round < 3 {
+            let printed = peers::run("mcap_read.py", [&repaired.path]);
+            assert!(printed.contains(&format!("rosbags {}", repaired.messages)), "round {round}");
+        }
+    }
+    assert_eq!(torn, 20, "a killed recorder leaves no footer");
 }

@@ -1,0 +1,120 @@
+"""Reads the flow of a running node out of shared memory with PyPI's iceoryx2 and NumPy, without a copy.
+
+    pip install iceoryx2==0.10.0 numpy
+    python examples/python/read_flow.py [prefix] [steps]
+"""
+
+import ctypes
+import sys
+
+import iceoryx2 as iox
+import numpy
+
+
+class FlowHeader(ctypes.Structure):
+    """Field by field as `nightflow::publish::shared::FlowHeader`; stamps are nanoseconds since the epoch."""
+
+    _fields_ = [
+        ("older_ns", ctypes.c_int64),
+        ("newer_ns", ctypes.c_int64),
+        ("published_ns", ctypes.c_int64),
+        ("step", ctypes.c_uint64),
+        ("displaced", ctypes.c_uint64),
+        ("lost", ctypes.c_uint64),
+        ("width", ctypes.c_uint32),
+        ("height", ctypes.c_uint32),
+        ("camera_width", ctypes.c_uint32),
+        ("camera_height", ctypes.c_uint32),
+        ("scale_x", ctypes.c_float),
+        ("scale_y", ctypes.c_float),
+        ("state", ctypes.c_uint32),  # 0 ok, 1 degraded, 2 blind
+        ("cause", ctypes.c_uint32),  # 0 none, 1 dark, 2 saturated, 3 gain step, 4 unsure, 5 frozen
+        ("gain", ctypes.c_float),
+        ("raw_mean", ctypes.c_float),
+        ("saturated", ctypes.c_float),
+        ("confidence", ctypes.c_float),
+    ]
+
+    @staticmethod
+    def type_name():
+        return "nightflow::FlowHeader"
+
+
+class VelocitySample(ctypes.Structure):
+    """Field by field as `nightflow::publish::shared::VelocitySample`; without a velocity `valid` is 0, numbers NaN."""
+
+    _fields_ = [
+        ("older_ns", ctypes.c_int64),
+        ("newer_ns", ctypes.c_int64),
+        ("published_ns", ctypes.c_int64),
+        ("step", ctypes.c_uint64),
+        ("linear", ctypes.c_double * 3),  # body frame, FLU: m/s, or 1/s when scale is 1
+        ("angular", ctypes.c_double * 3),  # rad/s
+        ("covariance", ctypes.c_double * 36),
+        ("distance", ctypes.c_double),
+        ("valid", ctypes.c_uint32),
+        ("scale", ctypes.c_uint32),
+        ("state", ctypes.c_uint32),
+        ("cause", ctypes.c_uint32),
+        ("lack", ctypes.c_uint32),
+        ("samples", ctypes.c_uint32),
+        ("inliers", ctypes.c_uint32),
+        ("quality", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name():
+        return "nightflow::VelocitySample"
+
+
+def floats(sample):
+    """The payload as a NumPy array over the shared memory itself; it holds until `sample.delete()`.
+
+    The binding's `Slice.len()` counts bytes and its `as_memory_view()` reads past the end (0.10), so the length comes
+    from the header and the address from `payload_ptr`.
+    """
+    length = sample.header.number_of_elements
+    return numpy.ctypeslib.as_array((ctypes.c_float * length).from_address(sample.payload_ptr))
+
+
+def open_floats(node, name):
+    service = node.service_builder(iox.ServiceName.new(name))
+    service = service.publish_subscribe(iox.Slice[ctypes.c_float]).user_header(FlowHeader).open()
+    return service.subscriber_builder().create()
+
+
+def main(prefix="nightflow", steps="0"):
+    iox.set_log_level_from_env_or(iox.LogLevel.Error)
+    node = iox.NodeBuilder.new().create(iox.ServiceType.Ipc)
+    flow, confidence = open_floats(node, f"{prefix}/flow"), open_floats(node, f"{prefix}/confidence")
+    velocity = node.service_builder(iox.ServiceName.new(f"{prefix}/velocity"))
+    velocity = velocity.publish_subscribe(VelocitySample).open().subscriber_builder().create()
+    wake = node.service_builder(iox.ServiceName.new(f"{prefix}/flow")).event().open().listener_builder().create()
+    print("reading", flush=True)
+
+    seen = 0
+    while int(steps) == 0 or seen < int(steps):
+        wake.timed_wait(iox.Duration.from_millis(1000))
+        while (sample := flow.receive()) is not None:
+            header = sample.user_header().contents
+            vectors = floats(sample).reshape(header.height, header.width, 2)
+            u, v = vectors.reshape(-1, 2).mean(axis=0)
+            corner = vectors[-1, -1]
+            print(f"flow {header.step} {header.width}x{header.height} state {header.state} mean {u:.4f} {v:.4f}",
+                  f"corner {corner[0]:.4f} {corner[1]:.4f} sum {vectors.sum(dtype=numpy.float64):.4f}", flush=True)
+            seen += 1
+            sample.delete()
+        while (sample := confidence.receive()) is not None:
+            header, sure = sample.user_header().contents, floats(sample)
+            print(f"confidence {header.step} {len(sure)} cells mean {sure.mean():.4f}", flush=True)
+            sample.delete()
+        while (sample := velocity.receive()) is not None:
+            found = sample.payload().contents
+            # No velocity is not standing still: nothing is known.
+            numbers = " ".join(f"{x:.4f}" for x in found.linear) if found.valid else "none"
+            print(f"velocity {found.step} {numbers} covariance {found.covariance[35]:.4f} quality {found.quality}", flush=True)
+            sample.delete()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
