@@ -16,25 +16,26 @@ use nightflow::{
 
 use crate::peers::Peer;
 
-/// Images go out for every fifth step.
+/// Images go out for every 25th step.
 pub fn config(namespace: &str) -> Config {
-    Config { iceoryx2: None, namespace: namespace.into(), image_hz_max: 10.0, ..Config::default() }
+    Config { iceoryx2: None, namespace: namespace.into(), image_hz_max: 2.0, ..Config::default() }
 }
 
 /// Offers step after step until the reader has enough of every topic, then finishes the sink.
 pub fn send_until_read(sink: &mut dyn Sink, reader: &mut Peer) {
     let until = Instant::now() + Duration::from_secs(60);
+    let (vectors, confidence) = vectors();
     let mut step = 0;
     std::thread::scope(|scope| {
         let done = scope.spawn(|| reader.line_starting("done", Duration::from_secs(60)));
         while !done.is_finished() {
             assert!(Instant::now() < until, "the reader neither fails nor comes to an end");
-            offer(sink, step);
+            offer(sink, step, &vectors, &confidence);
             if step % 10 == 0 {
                 sink.status(&status()).unwrap();
             }
             step += 1;
-            std::thread::sleep(Duration::from_millis(10));
+            std::thread::sleep(Duration::from_millis(20));
         }
         done.join().unwrap();
     });
@@ -43,14 +44,17 @@ pub fn send_until_read(sink: &mut dyn Sink, reader: &mut Peer) {
     assert!(sink.lost() * 10 <= step, "{} of {step} steps were lost", sink.lost());
 }
 
-fn offer(sink: &mut dyn Sink, step: u64) {
+const GRID: Grid = Grid { width: 320, height: 256, scale: [2.0, 4.0] };
+
+fn vectors() -> (Vec<f32>, Vec<f32>) {
+    let (cells, width) = (GRID.cells(), GRID.width);
+    let vectors = (0..cells).flat_map(|cell| [(cell % width) as f32, -0.5 * (cell / width) as f32]);
+    (vectors.collect(), (0..cells).map(|cell| (cell % 64) as f32 / 64.0).collect())
+}
+
+fn offer(sink: &mut dyn Sink, step: u64, vectors: &[f32], confidence: &[f32]) {
     let moved = moved(step);
-    let cells = moved.grid.cells();
-    let width = moved.grid.width;
-    let vectors: Vec<f32> = (0..cells).flat_map(|cell| [(cell % width) as f32, -0.5 * (cell / width) as f32]).collect();
-    let confidence: Vec<f32> = (0..cells).map(|cell| cell as f32 / 32.0).collect();
-    let flow =
-        Flow { older: moved.older, newer: moved.newer, grid: moved.grid, vectors: &vectors, confidence: &confidence };
+    let flow = Flow { older: moved.older, newer: moved.newer, grid: GRID, vectors, confidence };
     // A step that finds no room is counted by the sink, which is looked at in the end.
     let _ = sink.offer(&Offer { moved: &moved, flow, image: &Exposed::default() });
 }
@@ -80,8 +84,8 @@ fn moved(step: u64) -> Moved {
         older,
         newer,
         frame_id: Arc::from("camera_optical"),
-        camera_size: [16, 16],
-        grid: Grid { width: 8, height: 4, scale: [2.0, 4.0] },
+        camera_size: [640, 1024],
+        grid: GRID,
         gain: 20.0,
         raw_mean: 0.02,
         saturated_part: 0.01,

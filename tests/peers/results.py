@@ -4,10 +4,11 @@
 import math
 import struct
 
-ENOUGH = 4
+ENOUGH = 3
 STEP_NS = 20_000_000
-WIDTH, HEIGHT = 8, 4
-IMAGE_NS_MIN = 100_000_000
+# The network's own size: flow of 655 kB, which DDS has to take apart.
+WIDTH, HEIGHT = 320, 256
+IMAGE_NS_MIN = 500_000_000
 
 
 def ns(stamp):
@@ -18,7 +19,7 @@ def close(a, b):
     return math.isclose(a, b, rel_tol=1e-6)
 
 
-def wheel(u, v, longest):
+def hues():
     """The Middlebury benchmark's colorcode.cpp."""
     table = []
     for count, start, moving, rising in [(15, (255, 0, 0), 1, 1), (6, (255, 255, 0), 0, 0), (4, (0, 255, 0), 2, 1),
@@ -27,6 +28,10 @@ def wheel(u, v, longest):
             colour = list(start)
             colour[moving] = 255 * i // count if rising else 255 - 255 * i // count
             table.append(colour)
+    return table
+
+
+def wheel(u, v, longest, table=hues()):
     u, v = u / longest, v / longest
     radius = math.hypot(u, v)
     place = (math.atan2(-v, -u) / math.pi + 1) / 2 * (len(table) - 1)
@@ -132,13 +137,12 @@ class Results:
 
     def flow_confidence(self, message):
         data = self.image(message, "confidence", "32FC1", 4)
-        assert list(struct.unpack(f"<{WIDTH * HEIGHT}f", data)) == [i / 32 for i in range(WIDTH * HEIGHT)]
+        assert list(struct.unpack(f"<{WIDTH * HEIGHT}f", data)) == [i % 64 / 64 for i in range(WIDTH * HEIGHT)]
 
     def flow_preview(self, message):
         data = self.image(message, "preview", "rgb8", 3)
         longest = math.hypot(WIDTH - 1, 0.5 * (HEIGHT - 1))
-        for i in range(WIDTH * HEIGHT):
-            if i < WIDTH:
-                continue  # on the seam of the wheel, where the sign of zero decides
+        # The first row lies on the seam of the wheel, where the sign of zero decides.
+        for i in range(WIDTH, WIDTH * HEIGHT, 97):
             expected = wheel(i % WIDTH, -0.5 * (i // WIDTH), longest)
-            assert all(abs(a - b) <= 1 for a, b in zip(data[3 * i : 3 * i + 3], expected)), (i, data, expected)
+            assert all(abs(a - b) <= 1 for a, b in zip(data[3 * i : 3 * i + 3], expected)), (i, expected)
