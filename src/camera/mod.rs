@@ -160,7 +160,10 @@ pub const REASONS: &[(&str, &str)] = &[
     ("silence_s_max", "1: thirty frames of a 30 Hz camera, and soon enough for a pilot"),
     ("source.ros2.domain", "0: what ROS_DOMAIN_ID is where nobody set it"),
     ("source.ros2.reliable", "false: a frame that has to be sent again comes too late"),
-    ("source.ros2.receive_buffer_bytes", "0: all that the kernel allows, for a frame comes as hundreds of datagrams at once"),
+    (
+        "source.ros2.receive_buffer_bytes",
+        "0: all that the kernel allows, for a frame comes as hundreds of datagrams at once",
+    ),
     ("source.zenoh.connect", "where the router of rmw_zenoh listens on this machine"),
     ("source.zenoh.listen", "none: a free port of this machine only, as rmw_zenoh's nodes do"),
     ("source.zenoh.rmw", "true: the camera is a ROS 2 node with rmw_zenoh; false for plain zenoh programs"),
@@ -250,8 +253,7 @@ mod tests {
             let table = toml::Table::try_from(Config { source, ..Config::default() }).unwrap();
             list(&mut keys, "", &table);
         }
-        let reasons: BTreeSet<String> =
-            REASONS.iter().map(|(key, _)| (*key).to_owned()).collect();
+        let reasons: BTreeSet<String> = REASONS.iter().map(|(key, _)| (*key).to_owned()).collect();
         assert_eq!(keys, reasons);
     }
 

@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 mod allocations;
+mod bags;
 mod darkness;
 mod exposure;
 mod flow;
@@ -11,6 +12,8 @@ mod motion;
 mod peers;
 mod recording;
 mod results;
+mod road;
 mod ros2;
+mod tidy;
 mod wire;
 mod zenoh;

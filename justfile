@@ -1,0 +1,34 @@
+# What can be done here; `just` lists it.
+
+# List the recipes.
+default:
+    @just --list
+
+# The README's first command: a night recording becomes flow, pictures and a summary.
+demo:
+    cargo run --release -- replay recordings/night_flight.mcap --pictures target/pictures
+
+# The README's second command: all tests.
+test:
+    cargo test
+
+# What CI runs.
+ci:
+    .ci/run
+
+# Formatting and lints.
+lint:
+    cargo fmt --check
+    cargo clippy --all-targets -- -D warnings
+
+# Licences, advisories, duplicates, sources (needs cargo-deny).
+deny:
+    cargo deny check
+
+# All benches, and the table beside their rivals.
+bench:
+    cargo bench
+
+# Review changed snapshots (needs cargo-insta).
+snapshots:
+    cargo insta review

@@ -1,0 +1,107 @@
+//! What run, record and replay have in common: opening what the configuration names, and stopping.
+
+use std::{
+    collections::BTreeMap,
+    path::Path,
+    sync::{Arc, atomic::AtomicBool},
+};
+
+use anyhow::{Context, Result};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use nightflow::{
+    config::Config,
+    flow::Matcher,
+    node::{Outputs, Report},
+    publish::{self, iceoryx2::SharedSink, ros2::Ros2Sink, zenoh::ZenohSink},
+    recording::Recorder,
+};
+use signal_hook::consts::{SIGINT, SIGTERM};
+
+/// The configuration of a launch file, or the default where none is given.
+pub fn read(path: Option<&Path>) -> Result<Config> {
+    Ok(path.map(Config::read).transpose()?.unwrap_or_default())
+}
+
+/// A flag that the first interrupt sets; the second ends the program at once.
+pub fn stop() -> Result<Arc<AtomicBool>> {
+    let flag = Arc::new(AtomicBool::new(false));
+    for signal in [SIGINT, SIGTERM] {
+        // The order matters: the check for the second signal must be there before the flag is set by the first.
+        signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&flag))?;
+        signal_hook::flag::register(signal, Arc::clone(&flag))?;
+    }
+    Ok(flag)
+}
+
+/// What a recording says about how it was made; a replay takes its settings from it.
+pub fn provenance(config: &Config, network: Option<&Matcher>) -> Result<BTreeMap<String, String>> {
+    let mut known = BTreeMap::from([
+        ("version".to_owned(), env!("CARGO_PKG_VERSION").to_owned()),
+        ("config".to_owned(), config.to_toml()?),
+    ]);
+    if let Some(network) = network {
+        let model = network.model();
+        known.insert("model".to_owned(), format!("{} {}", model.name, model.version));
+        let files: Vec<String> = model.sha256.iter().map(|(file, hash)| format!("{file} {hash}")).collect();
+        known.insert("model_sha256".to_owned(), files.join(", "));
+        known.insert("provider".to_owned(), model.provider.clone());
+    }
+    Ok(known)
+}
+
+/// Opens every sink that the configuration names.
+pub fn outputs(config: &Config, network: Option<&Matcher>) -> Result<Outputs<'static>> {
+    let mut outputs = Outputs::default();
+    if let Some(shared) = &config.publish.iceoryx2 {
+        outputs.shared = Some(SharedSink::open(&config.publish, shared)?);
+    }
+    if let Some(recorder) = recorder(config, network)? {
+        outputs.sinks.push(Box::new(recorder));
+    }
+    network_sinks(&config.publish, &mut outputs)?;
+    Ok(outputs)
+}
+
+/// The recorder, if a file is named.
+pub fn recorder(config: &Config, network: Option<&Matcher>) -> Result<Option<Recorder>> {
+    let Some(path) = &config.recording.path else { return Ok(None) };
+    let recorder = Recorder::open(
+        &config.recording,
+        &config.camera,
+        &config.publish.namespace,
+        &config.publish.body_frame,
+        &provenance(config, network)?,
+    )
+    .with_context(|| format!("recording to {}", path.display()))?;
+    Ok(Some(recorder))
+}
+
+fn network_sinks(config: &publish::Config, outputs: &mut Outputs) -> Result<()> {
+    if let Some(ros2) = &config.ros2 {
+        outputs.sinks.push(Box::new(Ros2Sink::open(config, ros2)?));
+    }
+    if let Some(zenoh) = &config.zenoh {
+        outputs.sinks.push(Box::new(ZenohSink::open(config, zenoh)?));
+    }
+    Ok(())
+}
+
+/// A bar for a finite source, a running line for a live one; nothing where standard error is no terminal.
+pub fn progress(finite: bool) -> Result<ProgressBar> {
+    let bar = ProgressBar::with_draw_target(Some(1000), ProgressDrawTarget::stderr_with_hz(10));
+    let style = if finite { "{bar:40} {percent:>3} % {msg} {eta} left" } else { "{spinner} {elapsed} {msg}" };
+    bar.set_style(ProgressStyle::with_template(style)?);
+    Ok(bar)
+}
+
+/// Brings the bar up to the report.
+pub fn advance(bar: &ProgressBar, report: &Report, progress: Option<f64>) {
+    bar.set_position((progress.unwrap_or(0.0) * 1000.0) as u64);
+    bar.set_message(format!(
+        "{} frames, {} steps, {} displaced, {} spoiled",
+        report.frames,
+        report.steps,
+        report.source.displaced,
+        report.spoiled_count()
+    ));
+}

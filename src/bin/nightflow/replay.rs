@@ -1,0 +1,135 @@
+//! `nightflow replay`: the main job on a file, and the check that a recording gives the same bytes again.
+
+use std::{
+    path::{Path, PathBuf},
+    time::Duration,
+};
+
+use anyhow::{Context, Result, bail};
+use nightflow::{
+    camera,
+    config::Config,
+    node::{self, Outputs},
+    pipeline::Pipeline,
+    publish::pictures::Pictures,
+    recording::{self, check::Check},
+};
+
+use crate::{Exit, launch, summary::Summary};
+
+/// Turn a recording into flow and velocity.
+#[derive(clap::Args)]
+#[command(after_help = "\
+Examples:
+  nightflow replay recordings/night_flight.mcap --pictures pictures
+  nightflow replay bag/ --config launch_configs/replay.toml --out flow.mcap
+  nightflow replay flow.mcap --check
+
+A recording by Nightflow holds the settings it was made with, and they are used again; --config overrides them.")]
+pub struct Args {
+    /// An MCAP file, or a folder of rosbag2.
+    bag: PathBuf,
+    /// A launch file. Its [camera] source is replaced by the bag; its sinks are opened.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Write samples and results to this file.
+    #[arg(long, value_name = "OUT.mcap", conflicts_with = "check")]
+    out: Option<PathBuf>,
+    /// Keep the recording's own pace and drop frames as a live camera would make it drop them.
+    #[arg(long, conflicts_with = "check")]
+    realtime: bool,
+    /// Compare with the results that the recording holds, to the byte; exits with 1 at a difference.
+    #[arg(long)]
+    check: bool,
+    /// Write pictures of the flow and a plot of the velocity into this folder.
+    #[arg(long, value_name = "DIR")]
+    pictures: Option<PathBuf>,
+    /// A picture of every N-th step.
+    #[arg(long, value_name = "N", default_value_t = 10, requires = "pictures")]
+    pictures_every: u64,
+}
+
+/// Replays, prints the summary, and with --check the verdict.
+pub fn run(args: Args) -> Result<Exit> {
+    let mut config = effective(&args)?;
+    config.camera.source = camera::SourceConfig::Mcap(camera::Mcap { path: args.bag.clone(), realtime: args.realtime });
+    config.recording.path = args.out.clone();
+    let stop = launch::stop()?;
+    let mut pipeline = Pipeline::open(&config)?;
+    let mut pictures = args.pictures.as_deref().map(|dir| Pictures::open(dir, args.pictures_every)).transpose()?;
+    let mut check = args
+        .check
+        .then(|| Check::open(&args.bag, &config.publish.namespace, &config.publish.body_frame))
+        .transpose()?;
+    let mut outputs = launch::outputs(&config, Some(pipeline.network()))?;
+    if let Some(pictures) = &mut pictures {
+        outputs.sinks.push(Box::new(pictures));
+    }
+    if let Some(check) = &mut check {
+        outputs.sinks.push(Box::new(check));
+    }
+    let report = drive(&config, &mut pipeline, &mut outputs, &stop)?;
+    drop(outputs);
+    if report.frames == 0 {
+        bail!(camera::Error::Settings(format!(
+            "{} holds no frame on {}; [camera] image_topic names the topic",
+            args.bag.display(),
+            config.camera.image_topic
+        )));
+    }
+    let mut written: Vec<String> = args.out.iter().map(|path| path.display().to_string()).collect();
+    if let (Some(pictures), Some(dir)) = (&pictures, &args.pictures) {
+        written.push(format!("{} pictures and velocity.svg in {}", pictures.written(), dir.display()));
+    }
+    print!("{}", Summary { report: &report, outputs: written });
+    match check.map(Check::verdict) {
+        Some(Ok(checked)) => {
+            println!("check         {:>7} outputs are equal to the byte, {} holes", checked.equal, checked.holes)
+        }
+        Some(Err(difference)) => {
+            println!("check         differs: {difference}");
+            return Ok(Exit::Different);
+        }
+        None => {}
+    }
+    Ok(if report.lost_anything() { Exit::DataLost } else { Exit::Done })
+}
+
+fn drive(
+    config: &Config,
+    pipeline: &mut Pipeline,
+    outputs: &mut Outputs<'_>,
+    stop: &std::sync::atomic::AtomicBool,
+) -> Result<node::Report> {
+    let bar = launch::progress(true)?;
+    let report = node::drive(
+        &mut || camera::open(&config.camera),
+        Some(pipeline),
+        outputs,
+        stop,
+        Duration::from_secs_f64(config.camera.silence_s_max),
+        &mut |report, progress| launch::advance(&bar, report, progress),
+    );
+    bar.finish_and_clear();
+    Ok(report?)
+}
+
+/// The launch file's settings; or else those that the recording was made with, but for its sinks.
+fn effective(args: &Args) -> Result<Config> {
+    if let Some(path) = &args.config {
+        return launch::read(Some(path));
+    }
+    if !args.bag.exists() {
+        let missing = std::io::Error::new(std::io::ErrorKind::NotFound, "there is no such file or folder");
+        return Err(missing).with_context(|| args.bag.display().to_string());
+    }
+    let known = recording::metadata(&args.bag, "nightflow")?;
+    let mut config = match known.as_ref().and_then(|known| known.get("config")) {
+        Some(text) => Config::parse(text, Path::new(&format!("in {}", args.bag.display())))?,
+        None => Config::default(),
+    };
+    config.publish.iceoryx2 = None;
+    config.publish.ros2 = None;
+    config.publish.zenoh = None;
+    Ok(config)
+}
