@@ -93,7 +93,8 @@ def speed_table(scores: dict[int, Scores]) -> list[str]:
     lines = ["### Error by true displacement, held-out pairs (px)", ""]
     lines += [f"| noise level | {' | '.join(names)} |", "| --- " * (len(names) + 1) + "|"]
     for level, score in scores.items():
-        means = [np.concatenate(kept).mean() for kept in score.by_speed]
+        gathered = [np.concatenate(kept) for kept in score.by_speed]
+        means = [values.mean() if values.size else np.nan for values in gathered]
         lines += [f"| {level} | {' | '.join(f'{m:.2f}' for m in means)} |"]
     return [*lines, ""]
 
@@ -152,8 +153,12 @@ def main() -> None:
     parser.add_argument("--public", type=Path, help="folder of public pairs with ground truth (judging only)")
     parser.add_argument("--log", type=Path, default=Path("runs/fcdn/log.csv"))
     parser.add_argument("--count", type=int, default=100)
+    parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()
-    graphs = Exported(*(str(arguments.models / f"{arguments.name}_{p}.onnx") for p in ("pyramid", "decoder")))
+    torch.set_num_threads(arguments.threads)
+    cv2.setNumThreads(arguments.threads)
+    files = (str(arguments.models / f"{arguments.name}_{part}.onnx") for part in ("pyramid", "decoder"))
+    graphs = Exported(*files, arguments.threads)
     held, scores = HeldOut(arguments.photographs, arguments.count, seed=23), {}
     for level in NOISE_LEVELS:
         scores[level] = Scores()

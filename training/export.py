@@ -23,6 +23,23 @@ GOLDEN_ROWS, GOLDEN_COLUMNS = (4, 12, 20, 28), (4, 12, 20, 28, 36, 44)
 GOLDEN_TOLERANCE = 0.02
 
 
+class FrameGraph(nn.Module):
+    """The pyramid behind the interface that the node uses: five levels, whatever the network's coarsest is.
+
+    Levels that the network has not are given as averages of the coarsest, and nobody reads them.
+    """
+
+    def __init__(self, network: PwcNet):
+        super().__init__()
+        self.pyramid = network.pyramid
+
+    def forward(self, image):
+        features = list(self.pyramid(image))
+        while len(features) < len(LEVEL_NAMES):
+            features.append(nn.functional.avg_pool2d(features[-1], 2))
+        return tuple(features)
+
+
 class PairGraph(nn.Module):
     """The decoder behind the interface that the node uses.
 
@@ -79,13 +96,25 @@ def traced(module: nn.Module, inputs: tuple, names: list[str], outputs: list[str
     return onnx.load_from_string(memory.getvalue())
 
 
+def declare(decoder: onnx.ModelProto, inputs: list[str], features: list[torch.Tensor]) -> None:
+    """Puts the inputs that a shallow network does not read back into the decoder's interface, in order."""
+    present = {i.name: i for i in decoder.graph.input}
+    for name, feature in zip(inputs, [*features, *features]):
+        level = name.split("_")[1]
+        shape = [1, feature.shape[1], f"rows_{level}", f"columns_{level}"]
+        present.setdefault(name, onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape))
+    del decoder.graph.input[:]
+    decoder.graph.input.extend(present[name] for name in [*inputs, "scale"])
+
+
 def graphs_of(network: PwcNet) -> dict[str, onnx.ModelProto]:
     """`pyramid` and `decoder` graphs of a network in evaluation mode."""
     image = torch.rand(1, 3, GOLDEN_HEIGHT, GOLDEN_WIDTH)
-    features = network.pyramid(image)
+    frame = FrameGraph(network).eval()
+    features = frame(image)
     rows = {name: {2: f"rows_{name}", 3: f"columns_{name}"} for name in LEVEL_NAMES}
     pyramid = traced(
-        network.pyramid, (image,), ["image"], LEVEL_NAMES, {"image": {2: "height", 3: "width"}, **rows}
+        frame, (image,), ["image"], LEVEL_NAMES, {"image": {2: "height", 3: "width"}, **rows}
     )
     inputs = [f"{frame}_{name}" for frame in ("older", "newer") for name in LEVEL_NAMES]
     axes = {f"{frame}_{name}": rows[name] for frame in ("older", "newer") for name in LEVEL_NAMES}
@@ -93,6 +122,7 @@ def graphs_of(network: PwcNet) -> dict[str, onnx.ModelProto]:
     decoder = traced(
         PairGraph(network), (*features, *features, torch.ones(2)), [*inputs, "scale"], ["flow", "uncertainty"], axes
     )
+    declare(decoder, inputs, features)
     return {"pyramid": with_half_weights(pyramid), "decoder": with_half_weights(decoder)}
 
 
@@ -180,8 +210,9 @@ def main() -> None:
     parser.add_argument("--version", required=True, help="such as 2026-11-22.1")
     parser.add_argument("--models", type=Path, default=Path("../models"))
     arguments = parser.parse_args()
-    network = PwcNet().eval()
-    network.load_state_dict(torch.load(arguments.checkpoint, weights_only=True)["mean"])
+    state = torch.load(arguments.checkpoint, weights_only=True)
+    network = PwcNet(state["coarsest"]).eval()
+    network.load_state_dict(state["mean"])
     files = {}
     for part, graph in graphs_of(network).items():
         files[part] = arguments.models / f"{arguments.name}_{part}.onnx"

@@ -1,7 +1,8 @@
 """PWC-Net "small" for dark raw frames, as a pyramid (once a frame) and a decoder (once a pair).
 
-Layout as in Sun et al. 2018 without dense connections: six levels, cost volumes of +-4 at levels 6...2, a context
-network at level 2. Three things differ, each because it lets a short training get somewhere:
+Layout as in Sun et al. 2018 without dense connections: cost volumes of +-4 from the coarsest level to level 2, a context
+network at level 2. The coarsest level is a choice: 6 as published, or 4, which still reaches 64 px and is what a network
+trained on small crops should have, since there levels 5 and 6 are a handful of cells. Three things differ, each because it lets a short training get somewhere:
 
 * every level's features are normalised per frame (channel by channel, then pixel by pixel), so that the cost volume
   says something from the first step on;
@@ -19,7 +20,6 @@ from torch import nn
 CHANNELS = (3, 16, 32, 64, 96, 128, 196)
 DECODER_CHANNELS = (128, 128, 96, 64, 32)
 CONTEXT = ((128, 1), (128, 2), (128, 4), (96, 8), (64, 16), (32, 1))
-LEVELS = (6, 5, 4, 3, 2)
 REACH = 4
 SIDE = 2 * REACH + 1
 # Columns a tile of the cost volume has; inputs are multiples of 64 wide, so these divide the levels' widths.
@@ -33,6 +33,11 @@ def conv(inputs: int, outputs: int, stride: int = 1, dilation: int = 1) -> nn.Se
         nn.Conv2d(inputs, outputs, 3, stride, padding=dilation, dilation=dilation),
         nn.LeakyReLU(0.1, inplace=True),
     )
+
+
+def levels_from(coarsest: int) -> range:
+    """Levels in the order of decoding, such as 6, 5, 4, 3, 2."""
+    return range(coarsest, 1, -1)
 
 
 def cost_volume_plain(older: torch.Tensor, newer: torch.Tensor) -> torch.Tensor:
@@ -92,12 +97,13 @@ def normalised(features: torch.Tensor) -> torch.Tensor:
 
 
 class Pyramid(nn.Module):
-    """Image [B, 3, H, W] (linear RGB, mean about 0.4) to normalised features of level 2...6."""
+    """Image [B, 3, H, W] (linear RGB, mean about 0.4) to normalised features of level 2 to the coarsest."""
 
-    def __init__(self):
+    def __init__(self, coarsest: int):
         super().__init__()
+        channels = CHANNELS[: coarsest + 1]
         self.levels = nn.ModuleList(
-            nn.Sequential(conv(i, o, stride=2), conv(o, o), conv(o, o)) for i, o in zip(CHANNELS, CHANNELS[1:])
+            nn.Sequential(conv(i, o, stride=2), conv(o, o), conv(o, o)) for i, o in zip(channels, channels[1:])
         )
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -111,11 +117,11 @@ class Pyramid(nn.Module):
 class LevelDecoder(nn.Module):
     """One level: cost volume, five convolutions, a residual flow in pixels of this level."""
 
-    def __init__(self, level: int):
+    def __init__(self, level: int, coarsest: int):
         super().__init__()
         self.tile = TILES.get(level)
-        above = 0 if level == 6 else CHANNELS[level] + 2 + 2
-        widths = (SIDE * SIDE + 2 + above, *DECODER_CHANNELS)
+        above = 0 if level == coarsest else 2 + 2
+        widths = (SIDE * SIDE + 2 + CHANNELS[level] + above, *DECODER_CHANNELS)
         self.body = nn.Sequential(*(conv(i, o) for i, o in zip(widths, widths[1:])))
         self.predict = nn.Conv2d(widths[-1], 3, 3, padding=1)
         self.up_features = nn.ConvTranspose2d(widths[-1], 2, 4, 2, 1) if level > 2 else None
@@ -131,9 +137,9 @@ class LevelDecoder(nn.Module):
         pooled = F.avg_pool2d(volume.float(), 3, 1, 1, count_include_pad=False)
         weights = torch.softmax(pooled * self.sharpness.exp(), 1)
         argmax = F.conv2d(weights, self.offsets)
-        parts = [F.leaky_relu(volume, 0.1), argmax.to(volume.dtype)]
+        parts = [F.leaky_relu(volume, 0.1), argmax.to(volume.dtype), older]
         if above is not None:
-            parts += [older, above[0].to(volume.dtype), above[1]]
+            parts += [above[0].to(volume.dtype), above[1]]
         features = self.body(torch.cat(parts, 1))
         residual = self.predict(features).float()
         flow = residual[:, :2] + torch.sigmoid(residual[:, 2:]) * argmax
@@ -143,13 +149,14 @@ class LevelDecoder(nn.Module):
 class Decoder(nn.Module):
     """Two frames' features to the flow from the older to the newer frame, and its expected error.
 
-    Returns the flows of level 6...2, each in pixels of its level, and the expected end-point error [B, 1, H/4, W/4] in
+    Returns the flows from the coarsest level to level 2, each in pixels of its level, and the expected end-point error [B, 1, H/4, W/4] in
     pixels of the network's input.
     """
 
-    def __init__(self):
+    def __init__(self, coarsest: int):
         super().__init__()
-        self.levels = nn.ModuleList(LevelDecoder(level) for level in LEVELS)
+        self.coarsest = coarsest
+        self.levels = nn.ModuleList(LevelDecoder(level, coarsest) for level in levels_from(coarsest))
         widths = (DECODER_CHANNELS[-1], *(c for c, _ in CONTEXT))
         self.context = nn.Sequential(
             *(conv(i, o, dilation=d) for i, (o, d) in zip(widths, CONTEXT)), nn.Conv2d(widths[-1], 2, 3, padding=1)
@@ -158,7 +165,7 @@ class Decoder(nn.Module):
 
     def forward(self, older, newer):
         flows, above = [], None
-        for level, decoder in zip(LEVELS, self.levels):
+        for level, decoder in zip(levels_from(self.coarsest), self.levels):
             flow, features = decoder(older[level - 2], newer[level - 2], above)
             if level > 2:
                 up = 2.0 * F.interpolate(flow, scale_factor=2, mode="bilinear", align_corners=False)
@@ -173,9 +180,9 @@ class Decoder(nn.Module):
 class PwcNet(nn.Module):
     """Pyramid and decoder together, as they are trained."""
 
-    def __init__(self):
+    def __init__(self, coarsest: int = 6):
         super().__init__()
-        self.pyramid, self.decoder = Pyramid(), Decoder()
+        self.pyramid, self.decoder = Pyramid(coarsest), Decoder(coarsest)
         for module in self.modules():
             if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
                 nn.init.kaiming_normal_(module.weight, a=0.1)

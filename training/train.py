@@ -4,30 +4,53 @@ import argparse
 import copy
 import csv
 import math
+import os
 import time
 import tomllib
 from pathlib import Path
 
 import torch
+import torch.distributed as dist
 import torch.nn.functional as F
+from torch import nn
 
-from networks import LEVELS, PwcNet
+from networks import PwcNet, levels_from
 from pairs import HeldOut, batch_of
 from scenes import Textures
 
-LEVEL_WEIGHTS = dict(zip(LEVELS, (0.25, 0.25, 0.3, 0.5, 1.0)))
+LEVEL_WEIGHTS = {6: 0.25, 5: 0.25, 4: 0.4, 3: 0.5, 2: 1.0}
 JUDGED_LEVELS = (0, 10, 20, 30)
 
 
 def loss_of(flows, expected, truth):
     """Multi-scale end-point error in pixels of the input, plus the likelihood of the error head (exponential law)."""
     total = 0.0
-    for level, flow in zip(LEVELS, flows):
+    for level, flow in zip(levels_from(len(flows) + 1), flows):
         cell = 2**level
         error = (flow * cell - F.avg_pool2d(truth, cell)).square().sum(1, keepdim=True).add(1e-6).sqrt()
         total = total + LEVEL_WEIGHTS[level] * error.mean()
     error = error.detach()
     return total, (torch.log(expected) + error / expected).mean(), error.mean()
+
+
+def average_gradients(network: nn.Module) -> None:
+    """Under `torchrun`, the mean gradient of all workers, in one exchange a step."""
+    if dist.is_initialized():
+        gradients = [p.grad for p in network.parameters()]
+        flat = torch.cat([g.flatten() for g in gradients])
+        dist.all_reduce(flat)
+        flat /= dist.get_world_size()
+        for gradient, mean in zip(gradients, flat.split([g.numel() for g in gradients])):
+            gradient.copy_(mean.view_as(gradient))
+
+
+def agreed(value: bool, seconds: float) -> tuple[bool, float]:
+    """What the first worker says, so that all end a leg at the same step."""
+    if not dist.is_initialized():
+        return value, seconds
+    said = torch.tensor([float(value), seconds], dtype=torch.float64)
+    dist.broadcast(said, 0)
+    return bool(said[0]), said[1].item()
 
 
 class Run:
@@ -36,7 +59,7 @@ class Run:
     def __init__(self, description: dict):
         self.description = description
         torch.manual_seed(description["seed"])
-        self.network = PwcNet().to(memory_format=torch.channels_last)
+        self.network = PwcNet(description["coarsest"]).to(memory_format=torch.channels_last)
         self.mean = copy.deepcopy(self.network).requires_grad_(False)
         sharp = [p for n, p in self.network.named_parameters() if n.endswith("sharpness")]
         rest = [p for n, p in self.network.named_parameters() if not n.endswith("sharpness")]
@@ -75,6 +98,7 @@ class Run:
         loss, likelihood, error = loss_of(flows, expected, truth)
         self.optimizer.zero_grad(set_to_none=True)
         (loss + 0.1 * likelihood).backward()
+        average_gradients(self.network)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.description["clip"])
         self.optimizer.step()
         self.step += 1
@@ -91,6 +115,7 @@ class Run:
             "mean": self.mean.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "random": torch.get_rng_state(),
+            "coarsest": self.description["coarsest"],
             "step": self.step,
             "seconds": self.seconds,
         }
@@ -127,31 +152,42 @@ def judged(network: PwcNet, held: HeldOut) -> list[float]:
 
 def leg(run: Run, folder: Path, packed: Path, minutes: float, every: float) -> None:
     """Trains for so many minutes; a log row and a checkpoint every `every` minutes and at the end."""
-    textures, held = Textures(packed, held_out=False), HeldOut(packed, count=16)
-    zero = held.flow.norm(dim=1).mean().item()
-    log = folder / "log.csv"
-    if not log.exists():
-        heading = ["step", "minutes", "loss", "train_epe", *(f"epe_{n}" for n in JUDGED_LEVELS), "zero_flow", "rate"]
-        log.write_text(",".join(heading) + "\n")
-    began, row_due, losses = time.monotonic(), run.seconds + 60 * every, []
-    before = run.seconds
-    while True:
+    textures, first = Textures(packed, held_out=False), not dist.is_initialized() or dist.get_rank() == 0
+    log = Log(folder / "log.csv", packed) if first else None
+    if not first:  # Workers start from one checkpoint and must not draw the same scenes.
+        torch.manual_seed(1000 * run.step + dist.get_rank())
+    before, began, row_due, losses, over = run.seconds, time.monotonic(), run.seconds + 60 * every, [], False
+    while not over:
         crop = run.crop()
         pairs = batch_of(textures, crop["batch"], crop["height"], crop["width"], clean=run.description["clean"])
         losses.append(run.train_step(*pairs))
-        run.seconds = before + time.monotonic() - began
-        over = run.seconds - before >= 60 * minutes or run.progress() >= 1
-        if over or run.seconds >= row_due:
-            loss, train = (sum(v) / len(losses) for v in zip(*losses))
-            row = [run.step, f"{run.seconds / 60:.2f}", f"{loss:.3f}", f"{train:.3f}"]
-            row += [f"{e:.3f}" for e in judged(run.mean, held)] + [f"{zero:.3f}", f"{run.rate():.2e}"]
-            with open(log, "a", newline="") as file:
-                csv.writer(file, lineterminator="\n").writerow(row)
-            print(*row, flush=True)
+        seconds = before + time.monotonic() - began
+        over, run.seconds = agreed(seconds - before >= 60 * minutes, seconds)
+        over = over or run.progress() >= 1
+        if first and (over or run.seconds >= row_due):
+            log.row(run, losses)
             run.save(folder / "checkpoint.pt")
             row_due, losses = run.seconds + 60 * every, []
-        if over:
-            return
+
+
+class Log:
+    """The learning curve: a CSV row now and then, judged on the held-out pairs."""
+
+    def __init__(self, path: Path, packed: Path):
+        self.path, self.held = path, HeldOut(packed, count=16)
+        self.zero = self.held.flow.norm(dim=1).mean().item()
+        if not path.exists():
+            heading = ["step", "minutes", "loss", "train_epe", *(f"epe_{n}" for n in JUDGED_LEVELS), "zero_flow", "rate"]
+            path.write_text(",".join(heading) + "\n")
+
+    def row(self, run: Run, losses: list[tuple[float, float]]) -> None:
+        """Judges the running mean of the weights and writes where the run stands."""
+        loss, train = (sum(values) / len(losses) for values in zip(*losses))
+        row = [run.step, f"{run.seconds / 60:.2f}", f"{loss:.3f}", f"{train:.3f}"]
+        row += [f"{e:.3f}" for e in judged(run.mean, self.held)] + [f"{self.zero:.3f}", f"{run.rate():.2e}"]
+        with open(self.path, "a", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerow(row)
+        print(*row, flush=True)
 
 
 def main() -> None:
@@ -165,6 +201,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
+    if "WORLD_SIZE" in os.environ:
+        dist.init_process_group("gloo")
     run = Run(tomllib.loads(arguments.description.read_text()))
     folder = Path("runs") / arguments.description.stem
     folder.mkdir(parents=True, exist_ok=True)

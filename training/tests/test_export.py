@@ -16,11 +16,11 @@ from networks import PwcNet
 MODELS = Path(__file__).parents[2] / "models"
 
 
-@pytest.fixture(scope="module")
-def fresh():
-    """An untrained network and its graphs."""
+@pytest.fixture(scope="module", params=[4, 6])
+def fresh(request):
+    """An untrained network of either depth and its graphs."""
     torch.manual_seed(0)
-    network = PwcNet().eval()
+    network = PwcNet(request.param).eval()
     graphs = {part: graph.SerializeToString() for part, graph in graphs_of(network).items()}
     return rounded(network), graphs, Exported(graphs["pyramid"], graphs["decoder"])
 
@@ -40,6 +40,17 @@ def test_scale_multiplies_flow_but_not_the_expected_error(fresh):
     np.testing.assert_allclose(scaled, flow * np.array([2, 3], np.float32), rtol=1e-5)
     np.testing.assert_array_equal(error, same)
     assert flow.shape == (1, 32, 48, 2) and error.shape == (1, 32, 48)
+
+
+def test_the_interface_is_the_same_for_every_depth(fresh):
+    exported = fresh[2]
+    names = [f"level{level}" for level in range(2, 7)]
+    assert [i.name for i in exported.pyramid.get_inputs()] == ["image"]
+    assert [o.name for o in exported.pyramid.get_outputs()] == names
+    wanted = [f"{frame}_{name}" for frame in ("older", "newer") for name in names]
+    assert [i.name for i in exported.decoder.get_inputs()] == [*wanted, "scale"]
+    for name, feature in zip(names, exported.features(golden_frames()[0])):
+        assert feature.shape[2:] == (128 >> int(name[-1]), 192 >> int(name[-1]))
 
 
 def test_weights_are_stored_in_half_precision(fresh):

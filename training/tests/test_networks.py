@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from networks import LEVELS, PwcNet, cost_volume, cost_volume_plain
+from networks import PwcNet, levels_from, cost_volume, cost_volume_plain
 
 
 @pytest.mark.parametrize(
@@ -29,11 +29,12 @@ def test_cost_volume_peaks_at_the_displacement():
     assert (best == (2 + 4) * 9 + (-3 + 4)).all()
 
 
-def test_shapes_and_every_parameter_learns():
+@pytest.mark.parametrize("coarsest", [4, 6])
+def test_shapes_and_every_parameter_learns(coarsest):
     torch.manual_seed(0)
-    network = PwcNet()
+    network = PwcNet(coarsest)
     flows, expected = network(torch.rand(2, 3, 64, 128), torch.rand(2, 3, 64, 128))
-    assert [tuple(f.shape) for f in flows] == [(2, 2, 64 >> level, 128 >> level) for level in LEVELS]
+    assert [tuple(f.shape) for f in flows] == [(2, 2, 64 >> level, 128 >> level) for level in levels_from(coarsest)]
     assert expected.shape == (2, 1, 16, 32) and (expected > 0).all()
     (sum(f.square().sum() for f in flows) + expected.sum()).backward()
     for name, parameter in network.named_parameters():

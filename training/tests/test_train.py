@@ -2,13 +2,14 @@
 
 import pytest
 import torch
+import torch.distributed as dist
 
 from pairs import HeldOut, batch_of
 from scenes import Textures
-from train import Run, judged, leg
+from train import Run, agreed, average_gradients, judged, leg
 
 DESCRIPTION = {
-    "seed": 1, "clean": False, "peak_rate": 6e-4, "warm_up_steps": 5, "weight_decay": 1e-4, "clip": 1.0,
+    "seed": 1, "coarsest": 4, "clean": False, "peak_rate": 6e-4, "warm_up_steps": 5, "weight_decay": 1e-4, "clip": 1.0,
     "mean_decay": 0.9, "bf16": False, "schedule": {"steps": 6},
     "crops": [
         {"from": 0.0, "height": 64, "width": 64, "batch": 2},
@@ -94,3 +95,19 @@ def test_judging_does_not_move_the_random_state(packed):
     before = torch.get_rng_state()
     assert len(judged(network, held)) == 4
     assert torch.equal(before, torch.get_rng_state())
+
+
+def worker(rank: int, meeting: str) -> None:
+    """One of two workers whose gradients are 1 and 3 everywhere."""
+    dist.init_process_group("gloo", init_method=meeting, rank=rank, world_size=2)
+    network = torch.nn.Linear(3, 2)
+    for parameter in network.parameters():
+        parameter.grad = torch.full_like(parameter, 1.0 + 2.0 * rank)
+    average_gradients(network)
+    assert all((p.grad == 2.0).all() for p in network.parameters())
+    assert agreed(rank == 0, 7.0 + rank) == (True, 7.0)
+    dist.destroy_process_group()
+
+
+def test_two_workers_agree(tmp_path):
+    torch.multiprocessing.spawn(worker, (f"file://{tmp_path}/meeting",), nprocs=2)
