@@ -237,7 +237,7 @@ fn mistakes_are_answered_with_what_is_right() {
     bags::write(&empty, 0..0);
     let none = nightflow(&["replay", &empty_text]);
     assert_eq!(none.status.code(), Some(2));
-    assert!(text(&none).contains("no frame on /camera/image_raw"), "{}", text(&none));
+    assert!(text(&none).contains("expected frames on /camera/image_raw, found no message at all"), "{}", text(&none));
 }
 
 #[test]

@@ -13,7 +13,7 @@ mod watch;
 use std::process::ExitCode;
 
 use clap::{ArgAction, Parser, Subcommand};
-use nightflow::{camera, config::Error as ConfigError};
+use nightflow::{camera, config::Error as ConfigError, node};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -89,6 +89,7 @@ fn users_mistake(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| {
         cause.is::<ConfigError>()
             || matches!(cause.downcast_ref(), Some(camera::Error::Settings(_)))
+            || matches!(cause.downcast_ref(), Some(node::Error::Camera(camera::Error::Settings(_))))
             || cause
                 .downcast_ref::<std::io::Error>()
                 .is_some_and(|io| matches!(io.kind(), std::io::ErrorKind::NotFound | std::io::ErrorKind::IsADirectory))

@@ -5,7 +5,7 @@ use std::{
     time::Duration,
 };
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
 use nightflow::{
     camera,
     config::Config,
@@ -70,13 +70,6 @@ pub fn run(args: Args) -> Result<Exit> {
     }
     let report = drive(&config, &mut pipeline, &mut outputs, &stop)?;
     drop(outputs);
-    if report.frames == 0 {
-        bail!(camera::Error::Settings(format!(
-            "{} holds no frame on {}; [camera] image_topic names the topic",
-            args.bag.display(),
-            config.camera.image_topic
-        )));
-    }
     let mut written: Vec<String> = args.out.iter().map(|path| path.display().to_string()).collect();
     if let (Some(pictures), Some(dir)) = (&pictures, &args.pictures) {
         written.push(format!("{} pictures and velocity.svg in {}", pictures.written(), dir.display()));
