@@ -15,5 +15,6 @@ mod results;
 mod road;
 mod ros2;
 mod tidy;
+mod torn;
 mod wire;
 mod zenoh;
