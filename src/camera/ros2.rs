@@ -2,12 +2,7 @@
 
 use std::{pin::Pin, sync::Arc, thread::JoinHandle, time::Duration};
 
-use futures::{
-    Stream, StreamExt,
-    channel::oneshot,
-    future::{self, Either},
-    stream,
-};
+use futures::{Stream, StreamExt, future, stream};
 use ros2_client::{
     CreateResult, MessageInfo, MessageTypeName, Name, NodeName, NodeOptions, QosProfile, ReadError,
     dds::{Context, Node, Spinner, Subscription},
@@ -15,6 +10,7 @@ use ros2_client::{
 };
 use rustdds::{DomainParticipantBuilder, Topic};
 use serde::de::DeserializeOwned;
+use tokio::sync::oneshot;
 
 use super::{
     Config, Counts, Error, Frame, Next, Ros2, Sample, Source,
@@ -71,7 +67,7 @@ impl Ros2Source {
         let (stop, stopped) = oneshot::channel();
         let thread = std::thread::Builder::new()
             .name("camera-ros2".into())
-            .spawn(move || futures::executor::block_on(receive(node, readers, sender, stopped)))
+            .spawn(move || on_tokio(receive(node, readers, sender, stopped)))
             .map_err(|e| lost(e.to_string()))?;
         Ok(Self { latest, stop: Some(stop), thread: Some(thread) })
     }
@@ -114,6 +110,14 @@ pub(crate) fn join(domain: u16, name: &str, receive_buffer: usize) -> Result<Nod
 pub(crate) fn topic<M: Message>(node: &Node, name: &str, qos: &QosProfile) -> Result<Topic, String> {
     let parsed = Name::parse(name).map_err(|e| format!("{name} is no name of a topic: {e}"))?;
     node.create_topic(&parsed, MessageTypeName::new(M::PACKAGE, M::NAME), qos).map_err(|e| format!("{name}: {e}"))
+}
+
+/// Runs an edge's future on a runtime of this thread alone; no future reaches the frame path.
+pub(crate) fn on_tokio(edge: impl Future<Output = ()>) {
+    match tokio::runtime::Builder::new_current_thread().enable_all().build() {
+        Ok(runtime) => runtime.block_on(edge),
+        Err(e) => tracing::error!("no runtime for the edge to DDS: {e}"),
+    }
 }
 
 /// Keeps the node in the ROS graph until it is dropped.
@@ -178,9 +182,10 @@ async fn receive(mut node: Node, readers: Readers, sender: Sender, stopped: ones
         future::ready(())
     });
     // The spinner keeps the ROS graph; frames come without it too.
-    match future::select(Box::pin(spinning), Box::pin(delivering)).await {
-        Either::Left(((), delivering)) => delivering.await,
-        Either::Right(_) => {}
+    tokio::pin!(delivering);
+    tokio::select! {
+        () = spinning => delivering.await,
+        () = &mut delivering => {}
     }
 }
 

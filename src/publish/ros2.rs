@@ -88,7 +88,7 @@ impl Dds {
             node: Some(node),
             spinning: std::thread::Builder::new()
                 .name("publish-ros2-graph".into())
-                .spawn(move || futures::executor::block_on(dds::spin(spinner)))
+                .spawn(move || dds::on_tokio(dds::spin(spinner)))
                 .ok(),
         })
     }

@@ -8,6 +8,7 @@ mod exposure;
 mod flow;
 mod iceoryx2;
 mod latest;
+mod live;
 mod motion;
 mod peers;
 mod recording;
