@@ -2,6 +2,7 @@
 
 pub mod flight;
 pub mod noise;
+pub mod pan;
 mod path;
 pub mod profiles;
 mod scene;

@@ -3,7 +3,7 @@
 /// Albedo of red, green and blue, 0…1.
 pub(super) type Albedo = [f64; 3];
 
-const GRASS: Albedo = [0.20, 0.32, 0.14];
+const GRASS: Albedo = [0.25, 0.30, 0.19];
 const SOIL: Albedo = [0.38, 0.31, 0.24];
 const GRAVEL: Albedo = [0.45, 0.44, 0.42];
 

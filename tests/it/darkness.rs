@@ -6,6 +6,7 @@ use nightflow::{
     darkness::{
         flight::{self, Flight, Settings, Shot},
         noise::{Noise, Normals},
+        pan::{self, Pan, Photograph},
         profiles,
     },
     flow::Flow,
@@ -261,4 +262,79 @@ fn a_synthetic_flight_comes_out_right() {
     assert_eq!(steps, 120.0);
     assert!(rms < 0.09, "{rms} m/s");
     assert!((0.3..2.5).contains(&nees), "{nees}");
+}
+
+fn pan_settings(noise: Noise) -> pan::Settings {
+    pan::Settings { seed: 3, size: [40, 32], frames: 24, centre: [0.5; 2], sweep: [9.0, 6.0], dark_mean: 0.01, noise }
+}
+
+fn photograph(count: impl Fn(usize, usize) -> u16) -> Photograph {
+    let (width, height) = (200, 160);
+    let counts = (0..width * height).map(|i| count(i % width, i / width)).collect();
+    Photograph { width, height, counts, black: 0.0, white: 65_535.0 }
+}
+
+#[test]
+fn frames_of_a_pan_share_no_pixel_with_their_neighbours() {
+    let noise = Noise { a: [1e-5; 3], b: [1e-7; 3] };
+    let marked = photograph(|x, y| (y * 200 + x) as u16);
+    let views: Vec<pan::View> = Pan::new(marked.clone(), pan_settings(noise)).unwrap().collect();
+    assert_eq!(views.len(), 24);
+    for pair in views[..12].windows(2) {
+        assert_ne!(pair[0].lattice, pair[1].lattice);
+        assert!(pair[0].counts.iter().all(|pixel| !pair[1].counts.contains(pixel)), "consecutive frames share a pixel");
+    }
+    assert!(views[..12].iter().all(|view| view.factor == 1.0) && views[12].pan.is_some() && views[0].pan.is_none());
+    // The mosaic keeps its order: red cells come from red pixels, blue ones from blue.
+    for (i, pixel) in views[5].counts.iter().enumerate() {
+        let (x, y) = (*pixel as usize % 200, *pixel as usize / 200);
+        assert_eq!((x % 2, y % 2), (i % 40 % 2, i / 40 % 2));
+    }
+    let wide = pan::Settings { sweep: [40.0, 6.0], ..pan_settings(noise) };
+    assert!(matches!(Pan::new(marked, wide), Err(pan::Error::Small { .. })));
+}
+
+#[test]
+fn the_true_pan_is_how_the_picture_moves() {
+    let noise = Noise { a: [1e-5; 3], b: [1e-7; 3] };
+    // A ramp over cells: where it moves to shows in its mean.
+    let ramp = photograph(|x, y| (30 * (x / 2) + 50 * (y / 2) + 100) as u16);
+    let views: Vec<pan::View> = Pan::new(ramp, pan_settings(noise)).unwrap().collect();
+    let mean = |view: &pan::View| view.counts.iter().map(|c| f64::from(*c)).sum::<f64>() / view.counts.len() as f64;
+    let mut far = 0.0_f64;
+    for pair in views[..12].windows(2) {
+        let [u, v] = pair[1].pan.unwrap();
+        assert!((mean(&pair[1]) - mean(&pair[0]) + 30.0 * u + 50.0 * v).abs() < 1e-6, "{:?}", pair[1].pan);
+        assert!(u.abs() < 6.0 && v.abs() < 6.0, "the path is smooth");
+        far = far.max(u.hypot(v));
+    }
+    assert!(far > 2.0);
+}
+
+#[test]
+fn the_dark_half_of_a_pan_is_as_noisy_as_the_camera() {
+    let noise = Noise { a: [4e-4, 3e-4, 5e-4], b: [2e-7, 1e-7, 3e-7] };
+    let clean = 0.2;
+    let mut draws = Normals::new(1, 0);
+    let shot: Vec<u16> = (0..32_000)
+        .map(|i| (noise.gaussian(i % 200 % 2 + i / 200 % 2, clean, &mut draws).max(0.0) * 65_535.0).round() as u16)
+        .collect();
+    let views: Vec<pan::View> = Pan::new(photograph(|x, y| shot[y * 200 + x]), pan_settings(noise)).unwrap().collect();
+    let dark = &views[20..];
+    for colour in 0..3 {
+        let values: Vec<f64> = dark
+            .iter()
+            .flat_map(|view| view.counts.iter().enumerate())
+            .filter(|(i, _)| i % 40 % 2 + i / 40 % 2 == colour)
+            .map(|(_, count)| f64::from(*count) / 65_535.0)
+            .collect();
+        let mean = values.iter().sum::<f64>() / values.len() as f64;
+        let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / values.len() as f64;
+        assert!((mean - 0.01).abs() < 2e-4, "mean {mean}");
+        let expected = noise.variance(colour, 0.01);
+        assert!(
+            (variance / expected - 1.0).abs() < 0.1,
+            "colour {colour}: variance {variance:e}, the camera's {expected:e}"
+        );
+    }
 }

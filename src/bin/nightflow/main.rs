@@ -8,6 +8,7 @@ mod record;
 mod replay;
 mod run;
 mod summary;
+mod synth;
 mod watch;
 
 use std::process::ExitCode;
@@ -49,6 +50,9 @@ enum Command {
     Doctor(doctor::Args),
     /// Print the effective configuration with the reason of every value.
     Config(config::Args),
+    /// Make recordings with known truth.
+    #[command(subcommand)]
+    Synth(synth::Command),
 }
 
 /// How a subcommand ends when it ends well.
@@ -72,6 +76,7 @@ fn main() -> ExitCode {
         Command::Watch(args) => watch::run(args).map(|()| Exit::Done),
         Command::Doctor(args) => doctor::run(args),
         Command::Config(args) => config::run(args),
+        Command::Synth(command) => synth::run(command).map(|()| Exit::Done),
     };
     match ended {
         Ok(Exit::Done) => ExitCode::SUCCESS,
