@@ -12,6 +12,7 @@ mod live;
 mod motion;
 mod peers;
 mod recording;
+mod recordings;
 mod results;
 mod road;
 mod ros2;
