@@ -5,7 +5,6 @@
 
 use std::{
     env,
-    ffi::OsStr,
     fs::{self, File},
     io::{self, Read},
     path::{Path, PathBuf},
@@ -100,7 +99,7 @@ fn fetch(out: &Path, library: &Path) -> Result<(), String> {
     Ok(())
 }
 
-/// The wheel's file, by whichever pip there is, else by curl.
+/// The wheel's file, by whichever pip there is.
 fn download(out: &Path, wheel: &Wheel) -> Result<PathBuf, String> {
     let file = out.join(format!("onnxruntime-{VERSION}-cp311-cp311-{}.whl", wheel.platform));
     let requirement = format!("onnxruntime=={VERSION}");
@@ -124,33 +123,5 @@ fn download(out: &Path, wheel: &Wheel) -> Result<PathBuf, String> {
             Err(error) => tried.push(format!("{}: {error}", pip.join(" "))),
         }
     }
-    match by_curl(&file) {
-        Ok(()) => Ok(file),
-        Err(reason) => Err(format!("{}; curl: {reason}", tried.join("; "))),
-    }
-}
-
-/// For a machine that has no pip: PyPI's index names the address of every file.
-fn by_curl(file: &Path) -> Result<(), String> {
-    let curl = |arguments: &[&OsStr]| {
-        let answer = Command::new("curl")
-            .args(["-fsSL", "--retry", "1", "--connect-timeout", "15"])
-            .args(arguments)
-            .stdin(Stdio::null())
-            .output()
-            .map_err(|e| e.to_string())?;
-        if answer.status.success() {
-            return Ok(answer.stdout);
-        }
-        Err(String::from_utf8_lossy(&answer.stderr).trim().to_string())
-    };
-    let index = curl(&["https://pypi.org/simple/onnxruntime/".as_ref()])?;
-    let index = String::from_utf8_lossy(&index);
-    let name = file.file_name().and_then(OsStr::to_str).unwrap_or_default();
-    let address = index
-        .split('"')
-        .filter_map(|quoted| quoted.split('#').next())
-        .find(|address| address.starts_with("https://") && address.rsplit('/').next() == Some(name))
-        .ok_or_else(|| format!("{name} is not in PyPI's index"))?;
-    curl(&["-o".as_ref(), file.as_os_str(), address.as_ref()]).map(drop)
+    Err(tried.join("; "))
 }
