@@ -476,3 +476,19 @@ fn every_setting_has_its_reason() {
     assert_eq!(table.len(), REASONS.len(), "a reason without its setting");
     assert_eq!(Config::default(), table.try_into().unwrap());
 }
+
+#[test]
+fn a_velocity_allocates_nothing_after_the_first() {
+    let mut truth = Truth::hovering(5.0);
+    truth.velocity.x = 2.0;
+    let seen = truth.exact();
+    let mut odometer = truth.odometer(&seen, (-4..12).map(|k| OLDER_NS + k * 5_000_000), true);
+    let flow = truth.flow(&seen);
+    odometer.velocity(&flow, SIZE).unwrap();
+    let next = imu(OLDER_NS + 100_000_000, Vector3::zeros(), None);
+    let (found, taken) = crate::allocations::during(|| {
+        odometer.imu(&next).unwrap();
+        odometer.velocity(&flow, SIZE)
+    });
+    assert!(found.is_ok() && taken.calls == 0, "{taken:?}");
+}
