@@ -16,6 +16,7 @@ mod recordings;
 mod results;
 mod road;
 mod ros2;
+mod soak;
 mod tidy;
 mod torn;
 mod wire;
