@@ -44,7 +44,7 @@ fn any_base(all: &'static Definitions, base: &Base) -> BoxedStrategy<Value> {
         Base::Float32 => prop::num::f32::NORMAL.prop_map(|value| json!(value)).boxed(),
         Base::Float64 => prop::num::f64::NORMAL.prop_map(|value| json!(value)).boxed(),
         Base::String(_) => "\\PC{0,9}".prop_map(|text| json!(text)).boxed(),
-        Base::Wstring(_) => unimplemented!("no message here has one"),
+        Base::Wstring(_) => panic!("the walk reads no wstring, and no message here has one"),
         Base::Message(name) => any_value(all, name),
     }
 }
@@ -94,7 +94,7 @@ impl Writer {
                 self.out.extend_from_slice(text.as_bytes());
                 self.out.push(0);
             }
-            Base::Wstring(_) => unimplemented!("no message here has one"),
+            Base::Wstring(_) => panic!("the walk reads no wstring, and no message here has one"),
             Base::Message(name) => self.message(all, name, value),
         }
     }
