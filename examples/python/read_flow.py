@@ -95,6 +95,7 @@ def main(prefix="nightflow", steps="0"):
     seen = 0
     while int(steps) == 0 or seen < int(steps):
         wake.timed_wait(iox.Duration.from_millis(1000))
+        # The node sends a step's flow last, so whoever holds it finds the step's confidence and velocity there.
         while (sample := flow.receive()) is not None:
             header = sample.user_header().contents
             vectors = floats(sample).reshape(header.height, header.width, 2)
@@ -102,18 +103,35 @@ def main(prefix="nightflow", steps="0"):
             corner = vectors[-1, -1]
             print(f"flow {header.step} {header.width}x{header.height} state {header.state} mean {u:.4f} {v:.4f}",
                   f"corner {corner[0]:.4f} {corner[1]:.4f} sum {vectors.sum(dtype=numpy.float64):.4f}", flush=True)
+            step = header.step
+            sample.delete()
+            show_confidence(confidence, step)
+            show_velocity(velocity, step)
             seen += 1
-            sample.delete()
-        while (sample := confidence.receive()) is not None:
-            header, sure = sample.user_header().contents, floats(sample)
-            print(f"confidence {header.step} {len(sure)} cells mean {sure.mean():.4f}", flush=True)
-            sample.delete()
-        while (sample := velocity.receive()) is not None:
-            found = sample.payload().contents
+
+
+def show_confidence(confidence, step):
+    while (sample := confidence.receive()) is not None:
+        header, sure = sample.user_header().contents, floats(sample)
+        if header.step == step:
+            print(f"confidence {step} {len(sure)} cells mean {sure.mean():.4f}", flush=True)
+        reached = header.step >= step
+        sample.delete()
+        if reached:
+            return
+
+
+def show_velocity(velocity, step):
+    while (sample := velocity.receive()) is not None:
+        found = sample.payload().contents
+        if found.step == step:
             # No velocity is not standing still: nothing is known.
             numbers = " ".join(f"{x:.4f}" for x in found.linear) if found.valid else "none"
-            print(f"velocity {found.step} {numbers} covariance {found.covariance[35]:.4f} quality {found.quality}", flush=True)
-            sample.delete()
+            print(f"velocity {step} {numbers} covariance {found.covariance[35]:.4f} quality {found.quality}", flush=True)
+        reached = found.step >= step
+        sample.delete()
+        if reached:
+            return
 
 
 if __name__ == "__main__":
