@@ -6,6 +6,7 @@ mod bags;
 mod darkness;
 mod exposure;
 mod flow;
+mod flow_files;
 mod iceoryx2;
 mod latest;
 mod live;
