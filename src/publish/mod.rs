@@ -3,6 +3,7 @@
 mod courier;
 pub mod iceoryx2;
 pub mod outgoing;
+pub mod paint;
 pub mod pictures;
 mod plot;
 pub mod ros2;

@@ -4,18 +4,19 @@
 use std::path::{Path, PathBuf};
 
 use image::{Rgb, RgbImage};
-use noto_sans_mono_bitmap::{FontWeight, RasterHeight, get_raster, get_raster_width};
 
-use super::{Error, Moved, Offer, Sink, plot};
+use super::{
+    Error, Moved, Offer, Sink,
+    paint::{self, PAPER, display, write},
+    plot,
+};
 use crate::{
     exposure::Exposed,
     flow::{Flow, State, wheel},
 };
 
-const PAPER: Rgb<u8> = Rgb([250, 250, 248]);
-const INK: Rgb<u8> = Rgb([32, 32, 36]);
 const MARGIN: u32 = 12;
-const CAPTION: u32 = 24;
+const CAPTION: u32 = paint::LINE;
 const WHEEL: u32 = 108;
 /// A panel is drawn at least this wide, in whole steps of the developed image.
 const PANEL_MIN: u32 = 400;
@@ -147,15 +148,6 @@ fn longest(flow: &Flow<'_>) -> f32 {
     longest.max(1.0)
 }
 
-/// A linear pixel as a screen shows it (gamma 2.2).
-fn display(image: &Exposed, column: usize, row: usize, times: f32) -> [u8; 3] {
-    let plane = image.width * image.height;
-    std::array::from_fn(|c| {
-        let linear = (image.rgb[c * plane + row * image.width + column] * times).clamp(0.0, 1.0);
-        (linear.powf(1.0 / 2.2) * 255.0).round() as u8
-    })
-}
-
 /// Flow colour where it is trusted, the grey frame shining through where it isn't.
 fn overlay(flow: &Flow<'_>, image: &Exposed, column: usize, row: usize, longest: f32) -> [u8; 3] {
     let grid = flow.grid;
@@ -171,36 +163,7 @@ fn overlay(flow: &Flow<'_>, image: &Exposed, column: usize, row: usize, longest:
 
 /// The colour wheel with the length that its rim stands for.
 fn legend(canvas: &mut RgbImage, left: u32, top: u32, longest: f32) {
-    let radius = WHEEL as f32 / 2.0;
-    for y in 0..WHEEL {
-        for x in 0..WHEEL {
-            let (u, v) = ((x as f32 - radius) / radius, (y as f32 - radius) / radius);
-            if u.hypot(v) <= 1.0 {
-                canvas.put_pixel(left + x, top + y, Rgb(wheel::colour(u, v, 1.0)));
-            }
-        }
-    }
+    paint::wheel(canvas, left, top, WHEEL);
     let text = format!("rim {longest:.1} px");
     write(canvas, left.saturating_sub(14 * 9), top + WHEEL / 2 - 8, &text);
-}
-
-/// One line of text, its top left corner at (`left`, `top`); what does not fit is cut.
-fn write(canvas: &mut RgbImage, left: u32, top: u32, text: &str) {
-    let advance = get_raster_width(FontWeight::Regular, RasterHeight::Size16) as u32;
-    for (index, letter) in text.chars().enumerate() {
-        let Some(raster) = get_raster(letter, FontWeight::Regular, RasterHeight::Size16) else { continue };
-        for (y, line) in raster.rows().enumerate() {
-            for (x, shade) in line.iter().enumerate() {
-                let (column, row) = (left + index as u32 * advance + x as u32, top + y as u32);
-                if *shade > 0 && column < canvas.width() && row < canvas.height() {
-                    let part = f32::from(*shade) / 255.0;
-                    let below = canvas.get_pixel(column, row).0;
-                    let mixed = std::array::from_fn(|c| {
-                        (part * f32::from(INK.0[c]) + (1.0 - part) * f32::from(below[c])) as u8
-                    });
-                    canvas.put_pixel(column, row, Rgb(mixed));
-                }
-            }
-        }
-    }
 }

@@ -17,6 +17,7 @@ mod recordings;
 mod results;
 mod road;
 mod ros2;
+mod show;
 mod soak;
 mod tidy;
 mod torn;

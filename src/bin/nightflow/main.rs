@@ -7,6 +7,7 @@ mod launch;
 mod record;
 mod replay;
 mod run;
+mod show;
 mod summary;
 mod synth;
 mod watch;
@@ -14,7 +15,7 @@ mod watch;
 use std::process::ExitCode;
 
 use clap::{ArgAction, Parser, Subcommand};
-use nightflow::{camera, config::Error as ConfigError, node};
+use nightflow::{camera, config::Error as ConfigError, darkness::flow_files, node};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -50,6 +51,8 @@ enum Command {
     Doctor(doctor::Args),
     /// Print the effective configuration with the reason of every value.
     Config(config::Args),
+    /// Lay frames, flow, confidence and error of a flow file or a recording side by side, on one page.
+    Show(show::Args),
     /// Make recordings with known truth.
     #[command(subcommand)]
     Synth(synth::Command),
@@ -76,6 +79,7 @@ fn main() -> ExitCode {
         Command::Watch(args) => watch::run(args).map(|()| Exit::Done),
         Command::Doctor(args) => doctor::run(args),
         Command::Config(args) => config::run(args),
+        Command::Show(args) => show::run(&args).map(|()| Exit::Done),
         Command::Synth(command) => synth::run(command).map(|()| Exit::Done),
     };
     match ended {
@@ -93,6 +97,10 @@ fn main() -> ExitCode {
 fn users_mistake(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| {
         cause.is::<ConfigError>()
+            || matches!(
+                cause.downcast_ref(),
+                Some(flow_files::Error::Content { .. } | flow_files::Error::Ending { .. })
+            )
             || matches!(cause.downcast_ref(), Some(camera::Error::Settings(_)))
             || matches!(cause.downcast_ref(), Some(node::Error::Camera(camera::Error::Settings(_))))
             || cause
