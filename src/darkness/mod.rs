@@ -2,6 +2,7 @@
 
 pub mod flight;
 pub mod flow_files;
+pub mod level;
 pub mod noise;
 pub mod pan;
 mod path;

@@ -11,6 +11,7 @@ mod iceoryx2;
 mod latest;
 mod live;
 mod motion;
+mod noise;
 mod peers;
 mod recording;
 mod recordings;
