@@ -52,7 +52,8 @@ impl Sight {
     }
 
     fn length(&self) -> f64 {
-        self.residual[0].hypot(self.residual[1])
+        // Radians are far from overflow, and the root, unlike `hypot`, is exact to the bit on every machine.
+        (self.residual[0] * self.residual[0] + self.residual[1] * self.residual[1]).sqrt()
     }
 }
 

@@ -10,7 +10,7 @@ use super::{
     lens::Lens,
 };
 use crate::{
-    flow::Flow,
+    flow::{Flow, Grid},
     wire::{CameraInfo, Imu, Range},
 };
 
@@ -25,6 +25,9 @@ pub struct Odometer {
     mount: Rotation3<f64>,
     beam: Vector3<f64>,
     lens: Option<Lens>,
+    /// Rays of the raster's cells, row by row, and the raster that they belong to: they change with the calibration only.
+    rays: Vec<Option<[f64; 2]>>,
+    rays_of: Option<Grid>,
     rates: Rates,
     ranges: Ranges,
     fit: Fit,
@@ -72,6 +75,8 @@ impl Odometer {
             mount,
             beam: beam.normalize(),
             lens: None,
+            rays: Vec::new(),
+            rays_of: None,
             rates: Rates::new(imu),
             ranges: Ranges::new(),
             fit: Fit::default(),
@@ -80,7 +85,11 @@ impl Odometer {
 
     /// Takes a calibration.
     pub fn info(&mut self, info: &CameraInfo) -> Result<(), Error> {
-        self.lens = Lens::read(info)?;
+        let lens = Lens::read(info)?;
+        if self.lens != lens {
+            self.lens = lens;
+            self.rays_of = None;
+        }
         Ok(())
     }
 
@@ -160,9 +169,17 @@ impl Odometer {
         while grid.width.div_ceil(step) * grid.height.div_ceil(step) > self.config.samples_max {
             step += 1;
         }
+        let middle = |i: usize, scale: f32| (i as f64 + 0.5) * f64::from(scale) - 0.5;
+        let columns = || (step / 2..grid.width.max(step / 2 + 1)).step_by(step);
+        let rows = || (step / 2..grid.height.max(step / 2 + 1)).step_by(step);
+        if self.rays_of.replace(grid) != Some(grid) {
+            self.rays.clear();
+            let pixel = |row, column| [middle(column, grid.scale[0]), middle(row, grid.scale[1])];
+            self.rays.extend(rows().flat_map(|row| columns().map(move |column| lens.ray(pixel(row, column)))));
+        }
         let back = self.mount.inverse() * turn.rotation.to_rotation_matrix() * self.mount;
         let normal = self.mount.inverse() * normal;
-        let sight = |column: usize, row: usize| -> Option<Sight> {
+        let sight = |column: usize, row: usize, older: Option<[f64; 2]>| -> Option<Sight> {
             let cell = row * grid.width + column;
             let confidence = f64::from(*flow.confidence.get(cell)?);
             let vector = flow.vectors.get(2 * cell..2 * cell + 2)?;
@@ -170,10 +187,9 @@ impl Odometer {
             if !usable {
                 return None;
             }
-            let pixel =
-                [(column, grid.scale[0]), (row, grid.scale[1])].map(|(i, s)| (i as f64 + 0.5) * f64::from(s) - 0.5);
-            let older = lens.ray(pixel)?;
-            let newer = lens.ray([pixel[0] + f64::from(vector[0]), pixel[1] + f64::from(vector[1])])?;
+            let older = older?;
+            let [x, y] = [middle(column, grid.scale[0]), middle(row, grid.scale[1])];
+            let newer = lens.ray([x + f64::from(vector[0]), y + f64::from(vector[1])])?;
             let ray = Vector3::new(older[0], older[1], 1.0);
             let slope = normal.dot(&ray);
             let turned = back * Vector3::new(newer[0], newer[1], 1.0);
@@ -185,14 +201,11 @@ impl Odometer {
             let newer = [turned.x / turned.z, turned.y / turned.z];
             Some(Sight { older, newer, slope, weight, confidence, offered: true, ..Sight::default() })
         };
-        self.fit.columns = grid.width.div_ceil(step);
+        self.fit.columns = columns().count();
         self.fit.sights.clear();
-        for row in (step / 2..grid.height.max(step / 2 + 1)).step_by(step) {
-            for column in (step / 2..grid.width.max(step / 2 + 1)).step_by(step) {
-                self.fit.sights.push(sight(column, row).unwrap_or_default());
-            }
-        }
-        self.fit.columns = (step / 2..grid.width.max(step / 2 + 1)).step_by(step).count();
+        let cells = rows().flat_map(|row| columns().map(move |column| (column, row)));
+        let sights = cells.zip(&self.rays).map(|((column, row), ray)| sight(column, row, *ray).unwrap_or_default());
+        self.fit.sights.extend(sights);
     }
 
     /// From the fit's camera axes to the newer body axes, with everything that makes the velocity uncertain.
