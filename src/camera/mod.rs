@@ -138,6 +138,14 @@ pub struct Config {
     pub silence_s_max: f64,
 }
 
+impl Config {
+    /// Whether the source waits for whoever takes its samples: a recording that is not read at its own pace does, and
+    /// nothing of it need be lost to a slow taker.
+    pub fn waits(&self) -> bool {
+        matches!(&self.source, SourceConfig::Mcap(mcap) if !mcap.realtime)
+    }
+}
+
 impl Default for Config {
     fn default() -> Self {
         Self {

@@ -1,4 +1,4 @@
-//! What waits for the disk: bounded, in order, and never waited for by the side that fills it.
+//! What waits for the disk: bounded, in order, and waited for only by a source that waits itself.
 
 use std::{
     collections::VecDeque,
@@ -93,19 +93,19 @@ pub(super) struct Queue {
     small_max: usize,
     waiting: Mutex<Waiting>,
     came: Condvar,
+    left: Condvar,
 }
 
 impl Queue {
     pub(super) fn new(large_max: usize, small_max: usize) -> Self {
-        Self { large_max, small_max, waiting: Mutex::default(), came: Condvar::new() }
+        Self { large_max, small_max, waiting: Mutex::default(), came: Condvar::new(), left: Condvar::new() }
     }
 
     /// Adds an item, or answers how many of its size wait already; then it is lost.
     pub(super) fn push(&self, item: Item) -> Result<(), usize> {
         let mut waiting = self.lock();
         let (large, kind) = (item.large(), item.kind());
-        let (now, max) =
-            if large { (waiting.large, self.large_max) } else { (waiting.items.len() - waiting.large, self.small_max) };
+        let (now, max) = self.room(&waiting, large);
         if now >= max {
             waiting.lost[kind] = waiting.lost[kind].saturating_add(1);
             if let Item::Step(step) = item {
@@ -121,6 +121,21 @@ impl Queue {
         Ok(())
     }
 
+    /// How many of this size wait, and how many may.
+    fn room(&self, waiting: &Waiting, large: bool) -> (usize, usize) {
+        if large { (waiting.large, self.large_max) } else { (waiting.items.len() - waiting.large, self.small_max) }
+    }
+
+    /// Waits for at most `wait` until there is room for the item; true when there is.
+    pub(super) fn wait_for_room(&self, item: &Item, wait: Duration) -> bool {
+        let full = |waiting: &mut Waiting| {
+            let (now, max) = self.room(waiting, item.large());
+            now >= max
+        };
+        let waited = self.left.wait_timeout_while(self.lock(), wait, full).unwrap_or_else(PoisonError::into_inner);
+        !waited.1.timed_out()
+    }
+
     /// The oldest item, waiting for at most `wait`.
     pub(super) fn pop(&self, wait: Duration) -> Popped {
         let (mut waiting, _) = self
@@ -131,7 +146,10 @@ impl Queue {
         if item.as_ref().is_some_and(|(item, _)| item.large()) {
             waiting.large -= 1;
         }
-        Popped { item, closed: waiting.closed }
+        let closed = waiting.closed;
+        drop(waiting);
+        self.left.notify_all();
+        Popped { item, closed }
     }
 
     /// A step's box that was written and can be filled again.

@@ -27,6 +27,9 @@ use crate::{
 /// camera of 30 Hz gives 33 of a few hundred bytes each.
 const SMALL_PER_LARGE: usize = 64;
 
+/// A disk that fails while its queue is full is noticed after this time.
+const ROOM_WAIT: Duration = Duration::from_millis(100);
+
 /// What the recording thread counts for others to see.
 #[derive(Debug, Default)]
 struct Progress {
@@ -40,6 +43,8 @@ pub struct Recorder {
     path: PathBuf,
     frames: bool,
     flow: bool,
+    /// The source waits, so that nothing need be lost to a slow disk.
+    patient: bool,
     body_frame: String,
     queue: Arc<Queue>,
     progress: Arc<Progress>,
@@ -80,6 +85,7 @@ impl Recorder {
             path,
             frames: config.frames,
             flow: config.flow,
+            patient: cameras.waits(),
             body_frame: body_frame.into(),
             queue,
             progress,
@@ -104,6 +110,7 @@ impl Recorder {
     }
 
     fn keep(&mut self, item: Item, what: impl FnOnce() -> String) -> Result<(), publish::Error> {
+        while self.patient && self.failed().is_none() && !self.queue.wait_for_room(&item, ROOM_WAIT) {}
         if let Some(reason) = self.failed() {
             self.progress.lost.fetch_add(1, Ordering::Relaxed);
             return Err(publish::Error::Lost { sink: "recording", what: what(), reason });

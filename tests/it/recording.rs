@@ -395,3 +395,18 @@ fn what_the_disk_is_too_slow_for_is_counted_and_leaves_a_hole() {
         );
     }
 }
+
+#[test]
+fn a_source_that_waits_loses_nothing_to_a_slow_disk() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("patient.mcap");
+    let config = Config { path: Some(path.clone()), compression: Compression::Zstd, queue_max: 1, ..Config::default() };
+    let source = camera::SourceConfig::Mcap(camera::Mcap { path: "read.mcap".into(), realtime: false });
+    let cameras = camera::Config { source, ..camera::Config::default() };
+    let mut recorder = Recorder::open(&config, &cameras, "/nightflow", "base_link", &settings()).unwrap();
+    for k in 0..24 {
+        recorder.sample(&Sample::Frame(frame(k, 640, 480))).unwrap();
+    }
+    recorder.finish().unwrap();
+    assert_eq!((recorder.lost(), Messages::open(&path).unwrap().count()), (0, 24));
+}
