@@ -10,7 +10,7 @@ use std::{
 };
 
 use super::{
-    Config, Error, Offer,
+    Config, Error, Offer, Sink,
     outgoing::{self, Kept},
 };
 use crate::{
@@ -69,7 +69,7 @@ impl Topics {
 }
 
 /// Hands results to the thread that sends them, and never waits for it.
-pub(super) struct Courier {
+pub struct Courier {
     name: &'static str,
     body_frame: String,
     images: Pace,
@@ -124,7 +124,25 @@ impl Courier {
         })
     }
 
-    pub(super) fn offer(&mut self, offer: &Offer<'_>) -> Result<(), Error> {
+    fn order(&self, order: Order) -> Result<(), ()> {
+        self.orders.as_ref().ok_or(())?.try_send(order).map_err(|_| ())
+    }
+
+    fn full(&self, what: String) -> Error {
+        let reason = match self.orders {
+            Some(_) => format!("the network is behind by {STEPS_MAX} steps"),
+            None => "the sink is finished".into(),
+        };
+        Error::Lost { sink: self.name, what, reason }
+    }
+}
+
+impl Sink for Courier {
+    fn name(&self) -> &'static str {
+        self.name
+    }
+
+    fn offer(&mut self, offer: &Offer<'_>) -> Result<(), Error> {
         let moved = offer.moved;
         let Ok(mut parcel) = self.spare.try_recv() else {
             self.lost += 1;
@@ -143,12 +161,12 @@ impl Courier {
         })
     }
 
-    pub(super) fn status(&mut self, status: &Status) -> Result<(), Error> {
+    fn status(&mut self, status: &Status) -> Result<(), Error> {
         self.order(Order::Status(Box::new(status.clone()))).map_err(|()| self.full("a status".into()))
     }
 
     /// Sends what waits and ends the thread.
-    pub(super) fn finish(&mut self) -> Result<(), Error> {
+    fn finish(&mut self) -> Result<(), Error> {
         self.orders = None;
         let Some(thread) = self.thread.take() else { return Ok(()) };
         thread.join().map_err(|_| Error::Lost {
@@ -159,20 +177,8 @@ impl Courier {
     }
 
     /// Steps that found no room, and steps of which something could not be sent.
-    pub(super) fn lost(&self) -> u64 {
+    fn lost(&self) -> u64 {
         self.lost + self.unsent.load(Ordering::Relaxed)
-    }
-
-    fn order(&self, order: Order) -> Result<(), ()> {
-        self.orders.as_ref().ok_or(())?.try_send(order).map_err(|_| ())
-    }
-
-    fn full(&self, what: String) -> Error {
-        let reason = match self.orders {
-            Some(_) => format!("the network is behind by {STEPS_MAX} steps"),
-            None => "the sink is finished".into(),
-        };
-        Error::Lost { sink: self.name, what, reason }
     }
 }
 

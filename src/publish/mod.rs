@@ -1,6 +1,6 @@
 //! Stage 5: flow and velocity go out, to this machine's memory, to ROS 2 and to zenoh.
 
-mod courier;
+pub mod courier;
 pub mod iceoryx2;
 pub mod outgoing;
 pub mod paint;
@@ -11,6 +11,9 @@ pub mod shared;
 pub mod zenoh;
 
 use serde::{Deserialize, Serialize};
+
+/// `[publish.zenoh]`: the same settings as for a camera.
+pub use crate::camera::Zenoh;
 
 use crate::{
     camera::Sample,
@@ -216,26 +219,6 @@ impl Default for Iceoryx2 {
 pub struct Ros2 {
     /// DDS domain.
     pub domain: u16,
-}
-
-/// `[publish.zenoh]`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Zenoh {
-    /// Endpoints to connect to.
-    pub connect: Vec<String>,
-    /// Endpoints to listen on.
-    pub listen: Vec<String>,
-    /// Keys, tokens and attachments of rmw_zenoh (true), or the topic itself as the key (false).
-    pub rmw: bool,
-    /// ROS domain.
-    pub domain: u16,
-}
-
-impl Default for Zenoh {
-    fn default() -> Self {
-        Self { connect: vec!["tcp/localhost:7447".into()], listen: vec![], rmw: true, domain: 0 }
-    }
 }
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use ros2_client::{
 };
 
 use super::{
-    Config, Error, Offer, Ros2, Sink,
+    Config, Error, Ros2,
     courier::{Courier, Message, Network, Topics},
 };
 use crate::{
@@ -23,39 +23,10 @@ const ACK_BUFFER: usize = 1 << 20;
 /// What a reliable reader may miss and still be sent again.
 const DEPTH: usize = 10;
 
-/// Publishes reliably, which serves best-effort readers too.
-pub struct Ros2Sink {
-    courier: Courier,
-}
-
-impl Ros2Sink {
-    /// Joins the domain and offers every topic.
-    pub fn open(config: &Config, settings: &Ros2) -> Result<Self, Error> {
-        let network = Dds::join(config, settings).map_err(|reason| Error::Open { sink: NAME, reason })?;
-        Ok(Self { courier: Courier::open(NAME, config, network)? })
-    }
-}
-
-impl Sink for Ros2Sink {
-    fn name(&self) -> &'static str {
-        NAME
-    }
-
-    fn offer(&mut self, offer: &Offer<'_>) -> Result<(), Error> {
-        self.courier.offer(offer)
-    }
-
-    fn status(&mut self, status: &Status) -> Result<(), Error> {
-        self.courier.status(status)
-    }
-
-    fn finish(&mut self) -> Result<(), Error> {
-        self.courier.finish()
-    }
-
-    fn lost(&self) -> u64 {
-        self.courier.lost()
-    }
+/// Joins the domain and offers every topic, reliably, which serves best-effort readers too.
+pub fn open(config: &Config, settings: &Ros2) -> Result<Courier, Error> {
+    let network = Dds::join(config, settings).map_err(|reason| Error::Open { sink: NAME, reason })?;
+    Courier::open(NAME, config, network)
 }
 
 struct Dds {

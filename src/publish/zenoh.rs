@@ -3,7 +3,7 @@
 use ::zenoh::{Session, Wait, liveliness::LivelinessToken, pubsub::Publisher, qos::CongestionControl};
 
 use super::{
-    Config, Error, Offer, Sink, Zenoh,
+    Config, Error, Zenoh,
     courier::{Courier, Message, Network, Topics},
 };
 use crate::{
@@ -14,39 +14,11 @@ use crate::{
 
 const NAME: &str = "zenoh";
 
-/// Publishes, and drops rather than waits where a link is congested.
-pub struct ZenohSink {
-    courier: Courier,
-}
-
-impl ZenohSink {
-    /// Connects and declares every topic. Routers and readers may come, go and come again.
-    pub fn open(config: &Config, settings: &Zenoh) -> Result<Self, Error> {
-        let outlets = Outlets::open(config, settings).map_err(|reason| Error::Open { sink: NAME, reason })?;
-        Ok(Self { courier: Courier::open(NAME, config, outlets)? })
-    }
-}
-
-impl Sink for ZenohSink {
-    fn name(&self) -> &'static str {
-        NAME
-    }
-
-    fn offer(&mut self, offer: &Offer<'_>) -> Result<(), Error> {
-        self.courier.offer(offer)
-    }
-
-    fn status(&mut self, status: &Status) -> Result<(), Error> {
-        self.courier.status(status)
-    }
-
-    fn finish(&mut self) -> Result<(), Error> {
-        self.courier.finish()
-    }
-
-    fn lost(&self) -> u64 {
-        self.courier.lost()
-    }
+/// Connects and declares every topic; publishes, and drops rather than waits where a link is congested. Routers and
+/// readers may come, go and come again.
+pub fn open(config: &Config, settings: &Zenoh) -> Result<Courier, Error> {
+    let outlets = Outlets::open(config, settings).map_err(|reason| Error::Open { sink: NAME, reason })?;
+    Courier::open(NAME, config, outlets)
 }
 
 struct Outlets {

@@ -11,7 +11,7 @@ use nightflow::{
         self, Counts, Next, Sample, Source, SourceConfig,
         ros2::{RECEIVE_BUFFER_WANTED, receive_buffer_advice, receive_buffer_max},
     },
-    publish::{self, ros2::Ros2Sink},
+    publish,
 };
 
 use crate::{
@@ -245,7 +245,7 @@ fn a_name_that_is_no_topic_is_refused() {
 #[test]
 fn cyclonedds_reads_every_result() {
     let (domain, namespace) = place();
-    let mut sink = Ros2Sink::open(&results::config(&namespace), &publish::Ros2 { domain }).unwrap();
+    let mut sink = publish::ros2::open(&results::config(&namespace), &publish::Ros2 { domain }).unwrap();
     let mut reader = peers::spawn("dds_results.py", [domain.to_string(), namespace]);
     reader.line_starting("listening", LONG);
     results::send_until_read(&mut sink, &mut reader);

@@ -4,8 +4,7 @@ use std::{net::TcpListener, thread, time::Duration};
 
 use nightflow::{
     camera::{self, Counts, Next, Sample, Source, SourceConfig},
-    publish::{self, zenoh::ZenohSink},
-    wire,
+    publish, wire,
 };
 
 use crate::{
@@ -168,7 +167,7 @@ fn results_are_read(style: &str) {
     let endpoint = endpoint();
     let (domain, namespace) = place();
     let settings = publish::Zenoh { connect: vec![], listen: vec![endpoint.clone()], rmw: style == "rmw", domain };
-    let mut sink = ZenohSink::open(&results::config(&namespace), &settings).unwrap();
+    let mut sink = publish::zenoh::open(&results::config(&namespace), &settings).unwrap();
     let msgs = concat!(env!("CARGO_MANIFEST_DIR"), "/msgs");
     let args = [&endpoint, style, &domain.to_string(), &namespace, msgs];
     let mut reader = peers::spawn("zenoh_results.py", args);

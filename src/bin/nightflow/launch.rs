@@ -12,7 +12,7 @@ use nightflow::{
     config::Config,
     flow::Matcher,
     node::{Outputs, Report},
-    publish::{self, iceoryx2::SharedSink, ros2::Ros2Sink, zenoh::ZenohSink},
+    publish::{self, iceoryx2::SharedSink},
     recording::Recorder,
 };
 use signal_hook::consts::{SIGINT, SIGTERM};
@@ -78,10 +78,10 @@ pub fn recorder(config: &Config, network: Option<&Matcher>) -> Result<Option<Rec
 
 fn network_sinks(config: &publish::Config, outputs: &mut Outputs) -> Result<()> {
     if let Some(ros2) = &config.ros2 {
-        outputs.sinks.push(Box::new(Ros2Sink::open(config, ros2)?));
+        outputs.sinks.push(Box::new(publish::ros2::open(config, ros2)?));
     }
     if let Some(zenoh) = &config.zenoh {
-        outputs.sinks.push(Box::new(ZenohSink::open(config, zenoh)?));
+        outputs.sinks.push(Box::new(publish::zenoh::open(config, zenoh)?));
     }
     Ok(())
 }
