@@ -11,7 +11,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut args = std::env::args().skip(1);
     let prefix = args.next().unwrap_or_else(|| "nightflow".into());
     let steps: u64 = args.next().map_or(Ok(u64::MAX), |steps| steps.parse())?;
+    read(&prefix, steps)
+}
 
+/// Prints so many steps of the node with this prefix.
+pub fn read(prefix: &str, steps: u64) -> Result<(), Box<dyn std::error::Error>> {
     let node = NodeBuilder::new().create::<ipc::Service>()?;
     let name: ServiceName = format!("{prefix}/flow").as_str().try_into()?;
     let flow = node.service_builder(&name).publish_subscribe::<[f32]>().user_header::<FlowHeader>().open()?;
@@ -20,6 +24,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let name: ServiceName = format!("{prefix}/velocity").as_str().try_into()?;
     let velocity = node.service_builder(&name).publish_subscribe::<VelocitySample>().open()?;
     let velocity = velocity.subscriber_builder().create()?;
+    println!("reading");
 
     let mut seen = 0;
     // Woken by every step; the timeout only lets Ctrl-C through.
@@ -32,12 +37,16 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let [u, v] = vectors[middle];
             println!("step {}: {}×{}, {u:.3} {v:.3} px in the middle", header.step, header.width, header.height);
             seen += 1;
-        }
-        while let Some(sample) = velocity.receive()? {
-            match sample.valid {
-                1 => println!("step {}: velocity {:?}", sample.step, sample.linear),
-                // Not standing still: nothing is known.
-                _ => println!("step {}: no velocity", sample.step),
+            // The node sends a step's flow last, so that its velocity is there by now.
+            while let Some(sample) = velocity.receive()? {
+                match sample.valid {
+                    1 => println!("step {}: velocity {:?}", sample.step, sample.linear),
+                    // Not standing still: nothing is known.
+                    _ => println!("step {}: no velocity", sample.step),
+                }
+                if sample.step >= header.step {
+                    break;
+                }
             }
         }
     }

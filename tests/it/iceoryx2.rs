@@ -27,6 +27,11 @@ use super::{
 #[path = "../../src/bin/nightflow/watch.rs"]
 mod watch;
 
+// Only its `main` is not used here.
+#[allow(dead_code)]
+#[path = "../../examples/read_flow.rs"]
+mod read_flow;
+
 const ROLE: &str = "NIGHTFLOW_TEST_ROLE";
 const PATIENCE: Duration = Duration::from_secs(20);
 
@@ -61,6 +66,7 @@ fn in_another_process() {
                 println!("error: {error:#}");
             }
         }
+        ["read", prefix, steps] => read_flow::read(prefix, steps.parse().unwrap()).unwrap(),
         ["publish", prefix] => {
             let mut sink = open(prefix);
             for step in 0.. {
@@ -140,6 +146,27 @@ fn python_reads_flow_confidence_and_velocity() {
     }
     peer.finish(PATIENCE);
     assert_eq!((sink.copied(), sink.lost()), (0, 0));
+}
+
+#[test]
+fn the_rust_example_reads_in_another_process() {
+    let prefix = prefix("example");
+    let mut sink = open(&prefix);
+    let mut other = Other::start(&format!("read {prefix} 3"));
+    assert!(other.line("reading").is_some());
+    for step in 0..3 {
+        let state = if step == 1 { dark() } else { State::Ok };
+        send(&mut sink, &moved(step, state));
+        // The middle of 4×2 cells is the seventh: (step + 6, −6).
+        let flow = format!("step {step}: 4×2, {:.3} -6.000 px in the middle", step as f64 + 6.0);
+        assert_eq!(other.line("step").as_deref(), Some(flow.as_str()));
+        let velocity = match step {
+            1 => "step 1: no velocity".to_owned(),
+            _ => format!("step {step}: velocity [1.5, -0.25, {:.1}]", step as f64),
+        };
+        assert_eq!(other.line("step"), Some(velocity));
+    }
+    assert!(other.child.wait().unwrap().success());
 }
 
 #[test]
