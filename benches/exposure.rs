@@ -2,7 +2,7 @@
 
 use std::{
     hint::black_box,
-    path::{Path, PathBuf},
+    path::Path,
     process::{Command, ExitCode},
     time::{Duration, Instant},
 };
@@ -15,26 +15,11 @@ use nightflow::{
     wire::{Header, Image, Time},
 };
 
-const BLACK: u32 = 64;
-const WHITE: u32 = 4095;
+// The other bench uses the rest.
+#[allow(dead_code)]
+mod rivals;
 
-/// A count of the night scene that `rivals/develop.py` makes by the same formula: a chequered ground, noise, one lamp
-/// and some hot pixels.
-fn count(x: u32, y: u32, seed: u32) -> u16 {
-    let mut z = x.wrapping_mul(0x9e37_79b9) ^ y.wrapping_mul(0x85eb_ca6b) ^ seed.wrapping_mul(0xc2b2_ae35);
-    z = (z ^ (z >> 16)).wrapping_mul(0x7feb_352d);
-    z = (z ^ (z >> 15)).wrapping_mul(0x846c_a68b);
-    z ^= z >> 16;
-    let noise = (z & 15) + (z >> 4 & 15);
-    let ground = 20 + 60 * ((x / 64 + y / 64) % 2);
-    if (600..640).contains(&x) && (500..540).contains(&y) {
-        WHITE as u16
-    } else if x % 160 == 97 && y % 128 == 33 {
-        3000
-    } else {
-        (BLACK + ground + noise - 15) as u16
-    }
-}
+use rivals::{BLACK, count, python};
 
 fn counts(width: u32, height: u32, seed: u32) -> Vec<u16> {
     (0..height).flat_map(|y| (0..width).map(move |x| count(x, y, seed))).collect()
@@ -118,23 +103,6 @@ fn timed(config: &Config, frames: &[Frame]) -> ([f64; 2], Exposed) {
     times.sort_unstable();
     let newest = developer.newest().expect("a frame was developed");
     ([times[0], times[times.len() / 2]].map(|time| time.as_secs_f64() * 1e3), newest.clone())
-}
-
-/// A Python with what the rivals import, installed once under `target/rivals`.
-fn python() -> Result<PathBuf, String> {
-    let rivals = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/rivals");
-    let home = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/rivals");
-    let python = home.join("bin/python");
-    let run = |command: &mut Command| match command.status() {
-        Ok(status) if status.success() => Ok(()),
-        Ok(status) => Err(format!("{command:?} ended with {status}")),
-        Err(error) => Err(format!("{command:?}: {error}")),
-    };
-    if !python.is_file() {
-        run(Command::new("python3").args(["-m", "venv"]).arg(&home))?;
-    }
-    run(Command::new(&python).args(["-m", "pip", "install", "-q", "-r"]).arg(rivals.join("requirements.txt")))?;
-    Ok(python)
 }
 
 /// Runs the rival on the same frames, has it compare images, and prints both times.

@@ -27,8 +27,10 @@ use zenoh::Wait;
 
 const SIZES: [usize; 5] = [64, 4 << 10, 64 << 10, 1 << 20, 4 << 20];
 const PATIENCE: Duration = Duration::from_secs(2);
-/// Between messages, as a fast camera has it.
+/// Between messages, as a fast camera has it: every side has gone to sleep by then.
 const PAUSE: Duration = Duration::from_millis(4);
+/// Whether the pause comes before a message is filled, which is then sent at once, or between filling and sending.
+static PAUSE_FIRST: AtomicBool = AtomicBool::new(false);
 
 type Outcome<T> = Result<T, Box<dyn Error>>;
 
@@ -201,9 +203,11 @@ impl Way for Dds {
     }
 }
 
-/// The message lies ready: after a pause, in which every side goes to sleep, the clock starts.
+/// The message lies ready: the clock starts, now or after the pause.
 fn ready() -> Instant {
-    std::thread::sleep(PAUSE);
+    if !PAUSE_FIRST.load(Ordering::Relaxed) {
+        std::thread::sleep(PAUSE);
+    }
     Instant::now()
 }
 
@@ -236,6 +240,9 @@ fn measure(way: &mut dyn Way, messages: usize) -> Outcome<[Took; SIZES.len()]> {
                 continue;
             }
             while way.arrivals().try_recv().is_ok() {}
+            if PAUSE_FIRST.load(Ordering::Relaxed) {
+                std::thread::sleep(PAUSE);
+            }
             let sent = way.send(size)?;
             match way.arrivals().recv_timeout(PATIENCE) {
                 Ok(at) if k >= 10 => took.us.push(at.saturating_duration_since(sent).as_secs_f64() * 1e6),
@@ -254,8 +261,15 @@ fn main() -> Outcome<()> {
     println!("publish to receive in µs, p50 / p99 of {messages} messages, one machine, one run\n");
     println!("| way | {} | p50 largest/smallest |", SIZES.map(size_name).join(" | "));
     println!("|---|{}---|", "---|".repeat(SIZES.len()));
-    let ways: [(&str, Open); 3] = [
-        ("iceoryx2", || Ok(Box::new(Shared::open()?))),
+    let ways: [(&str, Open); 4] = [
+        ("iceoryx2, sent as soon as it is filled", || {
+            PAUSE_FIRST.store(true, Ordering::Relaxed);
+            Ok(Box::new(Shared::open()?))
+        }),
+        ("iceoryx2", || {
+            PAUSE_FIRST.store(false, Ordering::Relaxed);
+            Ok(Box::new(Shared::open()?))
+        }),
         ("zenoh, TCP and its shared memory", || Ok(Box::new(Zenoh::open()?))),
         ("DDS, reliable", || Ok(Box::new(Dds::open()?))),
     ];

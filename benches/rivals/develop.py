@@ -99,6 +99,7 @@ class Developer:
         if repaired.max() >= WHITE:
             full = cv2.dilate(cv2.compare(repaired, WHITE, cv2.CMP_GE), BLOCK, anchor=(0, 0))
             saturated = cv2.resize(full, OUT, interpolation=cv2.INTER_NEAREST) & 1
+        self.mask = saturated
         mean = float(reduced.mean(dtype=np.float64))
         gain = self.choose(mean)
         if self.reduced is not None and gain != self.gain:
