@@ -5,6 +5,7 @@ mod allocations;
 mod bags;
 mod darkness;
 mod exposure;
+mod fcdn;
 mod flow;
 mod flow_files;
 mod iceoryx2;
