@@ -1,6 +1,7 @@
 //! The laboratory of the paper: noise models, synthetic flights and darkness, and evaluation.
 
 mod curves;
+pub mod fcdn;
 pub mod flight;
 pub mod flow_files;
 pub mod gaussians;

@@ -1,5 +1,8 @@
 //! The recipes of the dark data set: the draws they rest on, their noise byte by byte, and the paper's table.
 
+mod set;
+mod table;
+
 use nightflow::darkness::{
     gaussians::Gaussians,
     recipes::{Drawn, Recipe},

@@ -10,12 +10,18 @@ mod run;
 mod show;
 mod summary;
 mod synth;
+mod synth_fcdn;
 mod watch;
 
 use std::process::ExitCode;
 
 use clap::{ArgAction, Parser, Subcommand};
-use nightflow::{camera, config::Error as ConfigError, darkness::flow_files, node};
+use nightflow::{
+    camera,
+    config::Error as ConfigError,
+    darkness::{fcdn, flow_files},
+    node,
+};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -53,7 +59,7 @@ enum Command {
     Config(config::Args),
     /// Lay frames, flow, confidence and error of a flow file or a recording side by side, on one page.
     Show(show::Args),
-    /// Make recordings with known truth.
+    /// Make recordings with known truth, and data sets for the dark.
     #[command(subcommand)]
     Synth(synth::Command),
 }
@@ -102,6 +108,7 @@ fn users_mistake(error: &anyhow::Error) -> bool {
                 Some(flow_files::Error::Content { .. } | flow_files::Error::Ending { .. })
             )
             || matches!(cause.downcast_ref(), Some(camera::Error::Settings(_)))
+            || cause.downcast_ref::<fcdn::Error>().is_some_and(fcdn::Error::mistaken)
             || matches!(cause.downcast_ref(), Some(node::Error::Camera(camera::Error::Settings(_))))
             || cause
                 .downcast_ref::<std::io::Error>()

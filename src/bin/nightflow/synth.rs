@@ -22,13 +22,15 @@ use nightflow::{
 /// Pan frames begin here; a fixed stamp, so that the same command gives the same bytes.
 const PAN_BEGIN_NS: i64 = 1_700_000_000_000_000_000;
 
-/// Make a recording whose truth is known.
+/// Make a recording whose truth is known, or a data set.
 #[derive(clap::Subcommand)]
 pub enum Command {
     /// Fly over a textured ground from dusk into the dark.
     Flight(FlightArgs),
     /// Pan over a real raw photograph so that consecutive frames carry independent real noise.
     Pan(PanArgs),
+    /// Turn clean pairs (FlyingChairs) into dark ones (FCDN).
+    Fcdn(crate::synth_fcdn::Args),
 }
 
 /// A drone flies over a textured plane with standing obstacles; frames, gyro, range, true flow and true velocity.
@@ -115,11 +117,12 @@ pub struct PanArgs {
     seed: u64,
 }
 
-/// Makes the recording.
+/// Makes the recording or the set.
 pub fn run(command: Command) -> Result<()> {
     match command {
         Command::Flight(args) => fly(&args),
         Command::Pan(args) => sweep(&args),
+        Command::Fcdn(args) => crate::synth_fcdn::run(&args),
     }
 }
 
