@@ -6,7 +6,7 @@ use nightflow::darkness::{
 };
 use rayon::prelude::*;
 
-const SIZE: [usize; 2] = [192, 144];
+const SIZE: [usize; 2] = [128, 96];
 
 /// A picture that a photograph might be: soft ground, and discs and bars of many sizes over it, each of one colour with
 /// a slight shade; smooth nearly everywhere, as pictures are.
@@ -20,10 +20,9 @@ fn picture(seed: u64) -> Vec<u8> {
     let light = 30.0 + next(150.0);
     let mut colour = || [0; 3].map(|_| (light + next(120.0) - 60.0).clamp(2.0, 253.0));
     let ground = [colour(), colour()];
-    let shapes: Vec<([f64; 3], [f64; 5])> = (0..14).map(|_| (colour(), [0.0; 5])).collect();
-    let mut shapes = shapes;
+    let mut shapes: Vec<([f64; 3], [f64; 5])> = (0..14).map(|_| (colour(), [0.0; 5])).collect();
     for (_, figures) in &mut shapes {
-        *figures = [next(width), next(height), 8.0 + next(40.0), 8.0 + next(40.0), next(0.3)];
+        *figures = [next(width), next(height), 6.0 + next(28.0), 6.0 + next(28.0), next(0.3)];
     }
     let mut bytes = Vec::with_capacity(SIZE[0] * SIZE[1] * 3);
     for y in 0..SIZE[1] {
@@ -50,14 +49,15 @@ fn level(frame: &[u8]) -> f64 {
     255.0 * noise_level_rgb([&planes[0], &planes[1], &planes[2]], SIZE[0], SIZE[1]).unwrap()
 }
 
-/// Both frames of a pair by the estimator, and what was drawn.
-fn levels(recipe: Recipe, pairs: u64) -> Vec<([f64; 2], Drawn)> {
+/// The older frames by the estimator, and what was drawn.
+fn levels(recipe: Recipe, pairs: u64) -> Vec<(f64, Drawn)> {
     (0..pairs)
         .into_par_iter()
         .map(|pair| {
-            let (mut older, mut newer) = (picture(2 * pair), picture(2 * pair));
+            let mut older = picture(pair);
+            let mut newer = older.clone();
             let drawn = recipe.darken(1, pair, &mut older, &mut newer).unwrap();
-            ([level(&older), level(&newer)], drawn)
+            (level(&older), drawn)
         })
         .collect()
 }
@@ -80,7 +80,7 @@ fn line(columns: [f64; 4]) -> String {
 fn noise_levels_are_those_of_the_papers_table() {
     let paper = TABLE.map(|count| 100.0 * f64::from(count) / f64::from(TABLE.iter().sum::<u32>()));
     let found = levels(Recipe::Paper, 320);
-    let ours = columns(found.iter().flat_map(|(levels, _)| *levels));
+    let ours = columns(found.iter().map(|(level, _)| *level));
     println!("noise level       0-10   10-20   20-30     >30  (% of images)");
     println!("paper's FCDN  {}", line(paper));
     println!("ours          {}", line(ours));
@@ -88,11 +88,8 @@ fn noise_levels_are_those_of_the_papers_table() {
         assert!((ours - paper).abs() < 3.0, "{ours} % where the paper has {paper} %");
     }
     // The level that is told without measuring is the one that is measured; below 4 a picture's own texture counts too.
-    let mut ratios: Vec<f64> = found
-        .iter()
-        .filter(|(_, drawn)| drawn.level > 4.0)
-        .flat_map(|(levels, drawn)| levels.map(|level| level / drawn.level))
-        .collect();
+    let mut ratios: Vec<f64> =
+        found.iter().filter(|(_, drawn)| drawn.level > 4.0).map(|(level, drawn)| level / drawn.level).collect();
     ratios.sort_by(f64::total_cmp);
     let at = |part: f64| ratios[(part * ratios.len() as f64) as usize];
     println!("measured over told: 5 % {:.3}, median {:.3}, 95 % {:.3}", at(0.05), at(0.5), at(0.95));
@@ -102,8 +99,8 @@ fn noise_levels_are_those_of_the_papers_table() {
 #[test]
 fn the_authors_script_is_stronger_than_their_table() {
     let found = levels(Recipe::Authors2021, 120);
-    let ours = columns(found.iter().flat_map(|(levels, _)| *levels));
+    let ours = columns(found.iter().map(|(level, _)| *level));
     println!("authors-2021  {}", line(ours));
-    // b alone is above 30 in 43 % of the pairs, and a comes on top.
-    assert!(ours[3] > 35.0 && ours[3] < 65.0, "{} % above 30", ours[3]);
+    // Their table has 0.7 % above 30. b alone is above 30 in 43 % of the pairs; a adds to it and clipping takes away.
+    assert!((ours[3] - 44.0).abs() < 8.0, "{} % above 30", ours[3]);
 }
