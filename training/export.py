@@ -12,6 +12,7 @@ import onnxruntime
 import torch
 from torch import nn
 
+import checkpoints
 from networks import PwcNet
 
 OPSET = 17
@@ -205,14 +206,15 @@ def write_manifest(path: Path, name: str, entry: str) -> None:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("checkpoint", type=Path, help="folder of pieces, such as runs/fcdn/checkpoint")
     parser.add_argument("--name", default="pwcnet_fcdn")
     parser.add_argument("--version", required=True, help="such as 2026-11-22.1")
     parser.add_argument("--models", type=Path, default=Path("../models"))
     arguments = parser.parse_args()
-    state = torch.load(arguments.checkpoint, weights_only=True)
+    state = checkpoints.load(arguments.checkpoint)
     network = PwcNet(state["coarsest"]).eval()
     network.load_state_dict(state["mean"])
+    arguments.models.mkdir(parents=True, exist_ok=True)
     files = {}
     for part, graph in graphs_of(network).items():
         files[part] = arguments.models / f"{arguments.name}_{part}.onnx"

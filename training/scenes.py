@@ -18,6 +18,7 @@ SIDE = 512
 HELD_OUT = 20
 # Least mean step between every fourth row of a window, in 1/255.
 DULL = 8.0
+THIN = 4
 # Share, least and greatest typical displacement in pixels.
 MIXTURE = ((0.05, 0.0, 0.0), (0.40, 0.2, 4.0), (0.35, 4.0, 12.0), (0.20, 12.0, 28.0))
 
@@ -43,26 +44,44 @@ def pack(photographs: Path, target: Path) -> None:
 
 
 class Textures:
-    """Random windows out of the packed photographs."""
+    """Random windows out of the packed photographs, on the default device."""
 
     def __init__(self, packed: Path, held_out: bool):
         with np.load(packed) as file:
             held = file["owners"] >= file["owners"].max() + 1 - HELD_OUT
-            self.squares = torch.from_numpy(file["squares"][held == held_out])
+            self.squares = torch.as_tensor(file["squares"][held == held_out], device=torch.get_default_device())
+        thin = self.squares[:, ::THIN, ::THIN].float()
+        steps = (thin[:, 1:] - thin[:, :-1]).abs().mean(3)
+        # Sums over all rectangles that begin at the corner, so that a window's mean step is four look-ups.
+        self.steps = F.pad(steps.double().cumsum(1).cumsum(2), (1, 0, 1, 0)).float()
 
     def draw(self, batch: int, side: int) -> torch.Tensor:
-        """[B, 3, side, side] in 0...1, with random mirror images."""
-        windows = []
-        for _ in range(batch):
-            for _ in range(4):
-                y, x = torch.randint(SIDE - side + 1, (2,)).tolist()
-                window = self.squares[torch.randint(len(self.squares), ()), y : y + side, x : x + side]
-                # Skies and gradients teach little: most of them are drawn again.
-                thin = window[::4, ::4].float()
-                if (thin[1:] - thin[:-1]).abs().mean() > DULL or torch.rand(()) < 0.1:
-                    break
-            windows.append(window.flip(1) if torch.rand(()) < 0.5 else window)
-        return torch.stack(windows).permute(0, 3, 1, 2).float().div_(255)
+        """[B, 3, side, side] in 0...1, with random mirror images.
+
+        Skies and gradients teach little: most of them are drawn again, three times at most. All four tries are drawn
+        at once, and nothing is read back from the device.
+        """
+        which = torch.randint(len(self.squares), (batch, 4))
+        y, x = torch.randint(SIDE - side + 1, (2, batch, 4))
+        rows, columns = (y // THIN).clamp(max=self.steps.shape[1] - 1 - side // THIN), x // THIN
+        below, right = rows + side // THIN, columns + side // THIN
+        corner = lambda at_y, at_x: self.steps[which, at_y, at_x]
+        total = corner(below, right) - corner(rows, right) - corner(below, columns) + corner(rows, columns)
+        lively = (total / (side // THIN) ** 2 > DULL) | (torch.rand(batch, 4) < 0.1)
+        lively[:, 3] = True
+        taken = lively.float().argmax(1)[:, None]
+        which, y, x = (drawn.gather(1, taken)[:, 0] for drawn in (which, y, x))
+        mirrored = torch.rand(batch) < 0.5
+        if self.squares.is_cuda:
+            along = torch.arange(side)
+            columns = torch.where(mirrored[:, None], x[:, None] + side - 1 - along, x[:, None] + along)
+            index = (which[:, None, None] * SIDE + (y[:, None] + along)[:, :, None]) * SIDE + columns[:, None]
+            windows = self.squares.view(-1, 3)[index]
+        else:
+            places = zip(which.tolist(), y.tolist(), x.tolist(), mirrored.tolist())
+            cut = [(self.squares[n, j : j + side, i : i + side], flip) for n, j, i, flip in places]
+            windows = torch.stack([window.flip(1) if flip else window for window, flip in cut])
+        return windows.permute(0, 3, 1, 2).float().div_(255)
 
 
 def uniform(batch: int, low: float, high: float) -> torch.Tensor:
@@ -114,6 +133,11 @@ def mapped(matrix: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
         ],
         1,
     )
+
+
+def inverse(matrix: torch.Tensor) -> torch.Tensor:
+    """[B, 3, 3]; homographies this mild have one, and asking the device whether they do would mean waiting for it."""
+    return torch.linalg.inv_ex(matrix).inverse
 
 
 class Surface:
@@ -186,13 +210,13 @@ def scene(textures: Textures, batch: int, height: int, width: int, shapes: int =
     camera = homographies(magnitude * (torch.rand(batch) > 0.1), *middle, size)
     ground = Surface(textures.draw(batch, side), height, width)
     first = ground.colour(points.expand(batch, -1, -1, -1))
-    second = ground.colour(mapped(camera.inverse(), points))
+    second = ground.colour(mapped(inverse(camera), points))
     flow = mapped(camera, points) - points
     for _ in range(shapes):
         outline, surface = Outline(batch, height, width), Surface(textures.draw(batch, side), height, width)
         own = homographies(magnitude * uniform(batch, 0.0, 1.2), outline.x, outline.y, 0.6 * size)
         motion = camera @ own
-        origin = mapped(motion.inverse(), points)
+        origin = mapped(inverse(motion), points)
         cover, cover_second = outline.cover(points), outline.cover(origin)
         first = torch.lerp(first, surface.colour(points.expand(batch, -1, -1, -1)), cover)
         second = torch.lerp(second, surface.colour(origin), cover_second)

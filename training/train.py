@@ -1,4 +1,5 @@
-"""Trains in legs: `train.py fcdn.toml --minutes 20 --resume` ends by itself with a checkpoint to go on from."""
+"""Trains in legs: `train.py fcdn.toml --minutes 9 --resume` ends by itself with a checkpoint to go on from, on a CPU or a
+GPU, and on another kind of machine than the leg before."""
 
 import argparse
 import copy
@@ -14,6 +15,7 @@ import torch.distributed as dist
 import torch.nn.functional as F
 from torch import nn
 
+import checkpoints
 from networks import PwcNet, levels_from
 from pairs import HeldOut, batch_of
 from scenes import Textures
@@ -59,7 +61,11 @@ class Run:
     def __init__(self, description: dict):
         self.description = description
         torch.manual_seed(description["seed"])
-        self.network = PwcNet(description["coarsest"]).to(memory_format=torch.channels_last)
+        # Made on the CPU, so that a seed means the same weights on every kind of machine.
+        with torch.device("cpu"):
+            network = PwcNet(description["coarsest"])
+        self.device = torch.get_default_device()
+        self.network = network.to(self.device, memory_format=torch.channels_last)
         self.mean = copy.deepcopy(self.network).requires_grad_(False)
         sharp = [p for n, p in self.network.named_parameters() if n.endswith("sharpness")]
         rest = [p for n, p in self.network.named_parameters() if not n.endswith("sharpness")]
@@ -70,6 +76,12 @@ class Run:
             ],
             fused=True,
         )
+        self.forward = self.network
+        if self.device.type == "cuda":
+            # Fuses what lies between the convolutions: cost volume, normalisation, warp.
+            self.forward = torch.compile(self.network) if description["compile"] else self.network
+            torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
+            torch.backends.cudnn.benchmark = True
         self.step, self.seconds = 0, 0.0
 
     def progress(self) -> float:
@@ -88,13 +100,14 @@ class Run:
         """The crop stage in force: the last whose start is reached."""
         return [c for c in self.description["crops"] if c["from"] <= self.progress()][-1]
 
-    def train_step(self, older, newer, truth) -> tuple[float, float]:
-        """One update; the loss and the end-point error of level 2."""
+    def train_step(self, older, newer, truth) -> tuple[torch.Tensor, torch.Tensor]:
+        """One update; the loss and the end-point error of level 2, left where they were computed: reading a number
+        makes the CPU wait for the GPU."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate() * group["factor"]
-        channels_last = {"memory_format": torch.channels_last}
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.description["bf16"]):
-            flows, expected = self.network(older.to(**channels_last), newer.to(**channels_last))
+        older, newer = (f.contiguous(memory_format=torch.channels_last) for f in (older, newer))
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.description["bf16"]):
+            flows, expected = self.forward(older, newer)
         loss, likelihood, error = loss_of(flows, expected, truth)
         self.optimizer.zero_grad(set_to_none=True)
         (loss + 0.1 * likelihood).backward()
@@ -104,33 +117,53 @@ class Run:
         self.step += 1
         decay = min(self.description["mean_decay"], self.step / (self.step + 10))
         with torch.no_grad():
-            for kept, new in zip(self.mean.parameters(), self.network.parameters()):
-                kept.lerp_(new, 1 - decay)
-        return loss.item(), error.item()
+            torch._foreach_lerp_(list(self.mean.parameters()), list(self.network.parameters()), 1 - decay)
+        return loss.detach(), error
 
-    def save(self, path: Path) -> None:
-        """Writes beside and renames, so that a leg cut short leaves the former checkpoint whole."""
+    def save(self, folder: Path) -> None:
+        """Weights and their mean in fp32, the optimizer's moments in bf16, in pieces.
+
+        The moments are rounded here too, so that going on and resuming are the same.
+        """
+        for moments in self.optimizer.state.values():
+            for name in ("exp_avg", "exp_avg_sq"):
+                moments[name].copy_(moments[name].bfloat16())
+        optimizer = self.optimizer.state_dict()
+
+        def narrow(name: str, value: torch.Tensor) -> torch.Tensor:
+            return value.bfloat16() if name in ("exp_avg", "exp_avg_sq") else value
+
         state = {
             "network": self.network.state_dict(),
             "mean": self.mean.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "moments": {i: {n: narrow(n, v) for n, v in m.items()} for i, m in optimizer["state"].items()},
             "random": torch.get_rng_state(),
             "coarsest": self.description["coarsest"],
             "step": self.step,
             "seconds": self.seconds,
         }
-        torch.save(state, path.with_suffix(".part"))
-        path.with_suffix(".part").replace(path)
+        if self.device.type == "cuda":
+            state["random_cuda"] = torch.cuda.get_rng_state()
+        checkpoints.save(state, folder)
 
-    def load(self, path: Path) -> None:
-        """Goes on where `save` left off, random numbers included."""
-        state = torch.load(path, weights_only=True)
+    def load(self, folder: Path) -> None:
+        """Goes on where `save` left off; the random numbers too, unless the leg before ran on another kind of machine."""
+        state = checkpoints.load(folder)
+        if state["coarsest"] != self.description["coarsest"]:
+            raise ValueError(
+                f"{folder}: expected a network from level {self.description['coarsest']}, found one from {state['coarsest']}"
+            )
         self.network.load_state_dict(state["network"])
         self.mean.load_state_dict(state["mean"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        for group in self.optimizer.param_groups:
-            group["fused"], group["foreach"] = True, None
+        optimizer = self.optimizer.state_dict()
+        # Moments come back as fp32, since that is what the weights are.
+        optimizer["state"] = state["moments"]
+        self.optimizer.load_state_dict(optimizer)
         torch.set_rng_state(state["random"])
+        if self.device.type == "cuda" and "random_cuda" in state:
+            torch.cuda.set_rng_state(state["random_cuda"])
+        elif self.device.type == "cuda":
+            torch.manual_seed(state["step"])
         self.step, self.seconds = state["step"], state["seconds"]
 
 
@@ -142,12 +175,19 @@ def judged(network: PwcNet, held: HeldOut) -> list[float]:
         older, newer = held.at(level)
         total = 0.0
         for i in range(0, len(older), 4):
-            with torch.autocast("cpu", torch.bfloat16):
+            with torch.autocast(older.device.type, torch.bfloat16):
                 flow = network(older[i : i + 4], newer[i : i + 4])[0][-1]
             full = F.interpolate(4 * flow, scale_factor=4, mode="bilinear", align_corners=False)
             total += (full - held.flow[i : i + 4]).norm(dim=1).mean((1, 2)).sum().item()
         errors.append(total / len(older))
     return errors
+
+
+def waited(device: torch.device) -> float:
+    """The clock, once the device has done what it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    return time.monotonic()
 
 
 def leg(run: Run, folder: Path, packed: Path, minutes: float, every: float) -> None:
@@ -157,16 +197,28 @@ def leg(run: Run, folder: Path, packed: Path, minutes: float, every: float) -> N
     if not first:  # Workers start from one checkpoint and must not draw the same scenes.
         torch.manual_seed(1000 * run.step + dist.get_rank())
     before, began, row_due, losses, over = run.seconds, time.monotonic(), run.seconds + 60 * every, [], False
+    told, counted = began + 30, 0
     while not over:
         crop = run.crop()
+        # One step in fifty is timed part by part; the others are not waited for.
+        timed = first and run.step % 50 == 20
+        start = waited(run.device) if timed else 0.0
         pairs = batch_of(textures, crop["batch"], crop["height"], crop["width"], clean=run.description["clean"])
+        made = waited(run.device) if timed else 0.0
         losses.append(run.train_step(*pairs))
+        counted += crop["batch"]
+        if timed:
+            end = waited(run.device)
+            share, now = (made - start) / (end - start), time.monotonic()
+            if now >= told:
+                told = now + 60
+                print(f"# {counted / (now - began):.1f} pairs/s; {100 * share:.0f} % of a step is spent making pairs", flush=True)
         seconds = before + time.monotonic() - began
         over, run.seconds = agreed(seconds - before >= 60 * minutes, seconds)
         over = over or run.progress() >= 1
         if first and (over or run.seconds >= row_due):
             log.row(run, losses)
-            run.save(folder / "checkpoint.pt")
+            run.save(folder / "checkpoint")
             row_due, losses = run.seconds + 60 * every, []
 
 
@@ -182,7 +234,7 @@ class Log:
 
     def row(self, run: Run, losses: list[tuple[float, float]]) -> None:
         """Judges the running mean of the weights and writes where the run stands."""
-        loss, train = (sum(values) / len(losses) for values in zip(*losses))
+        loss, train = (torch.stack(values).mean().item() for values in zip(*losses))
         row = [run.step, f"{run.seconds / 60:.2f}", f"{loss:.3f}", f"{train:.3f}"]
         row += [f"{e:.3f}" for e in judged(run.mean, self.held)] + [f"{self.zero:.3f}", f"{run.rate():.2e}"]
         with open(self.path, "a", newline="") as file:
@@ -199,15 +251,20 @@ def main() -> None:
     parser.add_argument("--every", type=float, default=4.0, help="minutes between log rows")
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     if "WORLD_SIZE" in os.environ:
-        dist.init_process_group("gloo")
+        dist.init_process_group("gloo" if arguments.device == "cpu" else "nccl")
+        if arguments.device == "cuda":
+            arguments.device = f"cuda:{os.environ['LOCAL_RANK']}"
+    # Scenes and network are made where this says.
+    torch.set_default_device(arguments.device)
     run = Run(tomllib.loads(arguments.description.read_text()))
     folder = Path("runs") / arguments.description.stem
     folder.mkdir(parents=True, exist_ok=True)
-    if arguments.resume and (folder / "checkpoint.pt").exists():
-        run.load(folder / "checkpoint.pt")
+    if arguments.resume and checkpoints.exists(folder / "checkpoint"):
+        run.load(folder / "checkpoint")
     leg(run, folder, arguments.photographs, arguments.minutes, arguments.every)
 
 
