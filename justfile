@@ -29,6 +29,11 @@ deny:
 bench:
     cargo bench
 
+# Ours and the rivals down the brightness ladder: see benches/rivals/README.md.
+ladder pairs out raft='':
+    cargo build --release
+    benches/rivals/ladder.sh {{pairs}} {{out}} {{raft}}
+
 # Review changed snapshots (needs cargo-insta).
 snapshots:
     cargo insta review

@@ -8,6 +8,7 @@ mod manifest;
 mod matcher;
 mod network;
 mod onnx;
+mod onnx_graph;
 pub mod padding;
 mod provider;
 pub mod runtime;
@@ -23,6 +24,7 @@ pub use self::{
     golden::Deviation,
     matcher::{Counts, Matcher},
     network::{Golden, Model, Network, Raster, Slot},
+    onnx_graph::Graph,
 };
 
 /// The raster that the flow is given on.

@@ -55,15 +55,15 @@ struct Memory {
 }
 
 /// An error of ONNX Runtime, with what it was asked to do.
-fn failed<R>(doing: &'static str) -> impl Fn(ort::Error<R>) -> Error {
+pub(super) fn failed<R>(doing: &'static str) -> impl Fn(ort::Error<R>) -> Error {
     move |error| Error::Session { doing, reason: error.to_string() }
 }
 
 /// A loaded library, and the file that it came from.
-type Loaded = (Environment, PathBuf);
+pub(super) type Loaded = (Environment, PathBuf);
 
 /// Loads the library once: a process can hold one only, and one environment of it.
-fn environment(config: &Config) -> Result<Loaded, Error> {
+pub(super) fn environment(config: &Config) -> Result<Loaded, Error> {
     static LOADED: Mutex<Option<Loaded>> = Mutex::new(None);
     let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
     let executable = env::current_exe().ok();

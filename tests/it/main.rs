@@ -4,6 +4,7 @@
 mod allocations;
 mod bags;
 mod darkness;
+mod eval;
 mod exposure;
 mod fcdn;
 mod flow;
@@ -13,6 +14,7 @@ mod latest;
 mod live;
 mod motion;
 mod noise;
+mod onnx_bytes;
 mod peers;
 mod recording;
 mod recordings;

@@ -3,6 +3,7 @@
 
 mod config;
 mod doctor;
+mod eval;
 mod launch;
 mod record;
 mod replay;
@@ -60,6 +61,9 @@ enum Command {
     /// Lay frames, flow, confidence and error of a flow file or a recording side by side, on one page.
     Show(show::Args),
     /// Make recordings with known truth, and data sets for the dark.
+    /// Judge methods on data sets with true flow, by exposure; climb down the brightness ladder.
+    Eval(eval::Args),
+    /// Make recordings with known truth.
     #[command(subcommand)]
     Synth(synth::Command),
 }
@@ -86,6 +90,7 @@ fn main() -> ExitCode {
         Command::Doctor(args) => doctor::run(args),
         Command::Config(args) => config::run(args),
         Command::Show(args) => show::run(&args).map(|()| Exit::Done),
+        Command::Eval(args) => eval::run(args),
         Command::Synth(command) => synth::run(command).map(|()| Exit::Done),
     };
     match ended {

@@ -1,0 +1,317 @@
+//! `nightflow eval`: methods judged on data sets with true flow, as they are or photographed ever darker.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use nightflow::{
+    darkness::{
+        bound,
+        datasets::{self, Found, Item, KINDS, Kind, Skipped},
+        enhance::Enhancer,
+        flow_files::Field,
+        ladder::{Linear, MEANS, Sensor},
+        methods::{Enhancing, Method, Shown},
+        picture::Picture,
+        report::{Record, Report},
+        score::score,
+    },
+    flow,
+};
+
+use crate::Exit;
+
+/// Judge methods on a data set with true flow: end-point error, outliers and angular error, by exposure.
+#[derive(clap::Args)]
+#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
+#[command(after_help = "\
+Examples:
+  nightflow eval VBOF/ --models pwcnet_fcdn,zero --out results
+  nightflow eval Sintel/training --models pwcnet_fcdn,raft=raft_small.onnx --linear
+  nightflow eval ladder pairs/ --camera 'Canon EOS M6' --iso 3200 --models pwcnet_fcdn,zero --enhancers none,nlm
+  nightflow eval pairs/ --models dis=results/dis --enhancers none
+
+A data set is known by its layout: VBOF (CCPPQQEE_img1.*), FlyingChairs and FCDN (NAME_img1.*, NAME_img2.*,
+NAME_flow.flo), Middlebury (other-data, other-gt-flow), Sintel (clean, final, flow), KITTI (image_2, flow_occ).
+A missing or torn file is named and left out, every cell says how many pairs it holds, and the program ends with 3.")]
+pub struct Args {
+    #[command(subcommand)]
+    ladder: Option<Sub>,
+    /// The data set's folder.
+    #[arg(required = true)]
+    dataset: Option<PathBuf>,
+    /// The files are sRGB pictures: undo the curve and bring the mean to 0.4, as the node sees the world.
+    #[arg(long)]
+    linear: bool,
+    #[command(flatten)]
+    how: How,
+}
+
+#[derive(clap::Subcommand)]
+enum Sub {
+    /// Photograph bright pairs at seven ever darker exposures with a camera's noise, and judge methods on each.
+    Ladder(LadderArgs),
+}
+
+/// The brightness ladder: linearise, expose to raw means of 0.4 … 0.001, count photons, read, quantise, scale to 0.4.
+#[derive(clap::Args)]
+#[command(after_help = "\
+Examples:
+  nightflow eval ladder pairs/ --models pwcnet_fcdn,zero --out results
+  nightflow eval ladder pairs/ --models zero --enhancers none,nlm --write dark
+  nightflow eval ladder pairs/ --models raft=raft_small.onnx,dis=results/dis --enhancers none,nlm,gaussian:2
+
+The limit is the Cramér–Rao bound of a square of 15 pixels (--patch) around each pixel.")]
+struct LadderArgs {
+    /// A data set with true flow, or any folder of NAME_img1.*, NAME_img2.*, NAME_flow.flo; sRGB pictures.
+    pairs: PathBuf,
+    /// The camera whose measured noise is drawn.
+    #[arg(long, default_value = "Canon EOS M6")]
+    camera: String,
+    /// Its sensitivity.
+    #[arg(long, default_value_t = 3200)]
+    iso: u32,
+    /// The same seed gives the same bits.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Side of the square that the limit is for, pixels, odd.
+    #[arg(long, default_value_t = bound::PATCH)]
+    patch: usize,
+    #[command(flatten)]
+    how: How,
+}
+
+#[derive(clap::Args)]
+struct How {
+    /// Methods, separated by commas: zero, a network of the manifest, NAME=FOLDER/NETWORK, NAME=FILE.onnx of two images
+    /// (0…255; @1 behind it: 0…1), NAME=FOLDER of other programs' ENHANCER/CONDITION/PAIR_flow.flo.
+    #[arg(long, value_delimiter = ',', default_value = "pwcnet_fcdn,zero")]
+    models: Vec<String>,
+    /// What frames go through first: none, nlm, gaussian[:SIGMA], median[:SIDE], onnx:FILE (NCHW, 0…1, such as SID).
+    #[arg(long, value_delimiter = ',', default_value = "none")]
+    enhancers: Vec<Enhancer>,
+    /// The layout, where it can't be told from the folder: vbof, pairs, middlebury, sintel, kitti.
+    #[arg(long, value_parser = kind)]
+    layout: Option<Kind>,
+    /// Only pairs whose name contains this.
+    #[arg(long, value_name = "TEXT")]
+    only: Option<String>,
+    /// Write table.md, table.csv, table.json and epe.svg into this folder.
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Write the very pixels that methods see: ENHANCER/CONDITION/PAIR_img1.png and _img2.png.
+    #[arg(long, value_name = "DIR")]
+    write: Option<PathBuf>,
+    /// Threads of the networks.
+    #[arg(long, default_value_t = 2)]
+    threads: usize,
+}
+
+fn kind(text: &str) -> Result<Kind, String> {
+    let names: Vec<&str> = KINDS.iter().map(|(name, _)| *name).collect();
+    let found = KINDS.iter().find(|(name, _)| *name == text).map(|(_, kind)| *kind);
+    found.ok_or_else(|| format!("{text:?} is no layout; expected {}", names.join(", ")))
+}
+
+/// Evaluates and prints the tables.
+pub fn run(args: Args) -> Result<Exit> {
+    match (args.ladder, args.dataset) {
+        (Some(Sub::Ladder(ladder)), _) => {
+            if ladder.patch.is_multiple_of(2) {
+                bail!("--patch is {}; expected an odd number of pixels, as 15", ladder.patch);
+            }
+            let sensor = Sensor::find(&ladder.camera, ladder.iso)?;
+            let about = vec![
+                ("camera".to_owned(), format!("{} at ISO {}, seed {}", ladder.camera, ladder.iso, ladder.seed)),
+                ("limit".to_owned(), format!("Cramér–Rao, a square of {0} × {0} pixels", ladder.patch)),
+            ];
+            let light = Light::Ladder { sensor, seed: ladder.seed, patch: ladder.patch };
+            evaluate(&ladder.pairs, &light, &ladder.how, about)
+        }
+        (None, Some(dataset)) => {
+            let light = if args.linear { Light::Linear } else { Light::AsItIs };
+            evaluate(&dataset, &light, &args.how, vec![])
+        }
+        (None, None) => bail!("a data set's folder is needed"),
+    }
+}
+
+/// In what light the pairs are shown.
+enum Light {
+    AsItIs,
+    Linear,
+    Ladder { sensor: Sensor, seed: u64, patch: usize },
+}
+
+/// A pair in one light.
+struct View {
+    condition: String,
+    shown: String,
+    frames: [Picture; 2],
+    truths: Vec<(String, Field)>,
+    limit: Option<bound::Limit>,
+}
+
+fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, String)>) -> Result<Exit> {
+    let Found { kind, mut items, mut skipped } = datasets::find(folder, how.layout)?;
+    if kind == Kind::Vbof && matches!(light, Light::Ladder { .. }) {
+        bail!("{} has been photographed in the dark already; a ladder wants bright sRGB pairs", folder.display());
+    }
+    if let Some(text) = &how.only {
+        items.retain(|item| item.name.contains(text));
+        skipped.retain(|left| left.what.contains(text));
+    }
+    if items.is_empty() && skipped.is_empty() {
+        bail!("{} has no pair{}", folder.display(), how.only.as_ref().map_or(String::new(), |t| format!(" named {t}")));
+    }
+    let config = flow::Config { threads: how.threads, ..flow::Config::default() };
+    let mut methods = how.models.iter().map(|given| Method::open(given, &config)).collect::<Result<Vec<_>, _>>()?;
+    let enhancers = how.enhancers.iter().cloned().map(|by| Enhancing::open(by, &config));
+    let mut enhancers = enhancers.collect::<Result<Vec<_>, _>>()?;
+    let layout = KINDS.iter().find(|(_, known)| *known == kind).map_or("", |(name, _)| name);
+    about.insert(0, ("data".into(), format!("{} ({layout}), {} pairs", folder.display(), items.len())));
+    about.extend(methods.iter().map(|method| (method.name.clone(), method.about())));
+    let mut report = Report { about, skipped, ..Report::default() };
+    let rungs = if matches!(light, Light::Ladder { .. }) { MEANS.len() } else { 1 };
+    let bar = progress(items.len() * rungs * enhancers.len())?;
+    for item in &items {
+        bar.set_message(item.name.clone());
+        match datasets::load(item) {
+            Ok(loaded) => {
+                for view in views(item, loaded, light, rungs) {
+                    judge(item, view, &mut methods, &mut enhancers, how, &mut report, &bar)?;
+                }
+            }
+            Err(left) => {
+                bar.inc((rungs * enhancers.len()) as u64);
+                report.skipped.push(left);
+            }
+        }
+    }
+    bar.finish_and_clear();
+    publish(&report, how)
+}
+
+/// The pair in every light, made when its turn comes.
+fn views(item: &Item, loaded: datasets::Loaded, light: &Light, rungs: usize) -> impl Iterator<Item = View> {
+    let linear = (!matches!(light, Light::AsItIs)).then(|| Linear::of([&loaded.frames[0], &loaded.frames[1]]));
+    (0..rungs).map(move |at| {
+        let truths = loaded.truths.clone();
+        let whole = (item.condition.clone(), item.condition.clone());
+        let (condition, shown, frames, limit) = match (light, &linear) {
+            (Light::Ladder { sensor, seed, patch }, Some(linear)) => {
+                let rung = linear.expose(sensor, MEANS[at], *seed, &item.name);
+                let limit = truths.first().and_then(|(_, truth)| bound::limit(&rung, truth, *patch));
+                let noise = 255.0 * rung.noise.variance(1, 0.4).sqrt();
+                let shown = format!("Exp-{at} (mean {}, noise {noise:.1}/255)", MEANS[at]);
+                (format!("Exp-{at}"), shown, rung.pictures(), limit)
+            }
+            (Light::Linear, Some(linear)) => (whole.0, whole.1, linear.scaled(), None),
+            _ => (whole.0, whole.1, loaded.frames.clone(), None),
+        };
+        View { condition, shown, frames, truths, limit }
+    })
+}
+
+/// Every enhancer and method on one view of a pair.
+fn judge(
+    item: &Item,
+    view: View,
+    methods: &mut [Method],
+    enhancers: &mut [Enhancing],
+    how: &How,
+    report: &mut Report,
+    bar: &ProgressBar,
+) -> Result<()> {
+    let ladder = view.condition != item.condition;
+    // Where the truth comes in several kinds, they are what the table is sorted by.
+    let sorted = |truth: &str| match (ladder, view.truths.len()) {
+        (true, 1) => (view.condition.clone(), view.shown.clone()),
+        (true, _) => (format!("{} {truth}", view.condition), format!("{} {truth}", view.shown)),
+        (false, _) => (truth.to_owned(), truth.to_owned()),
+    };
+    for (truth, _) in &view.truths {
+        let (condition, shown) = sorted(truth);
+        if !report.conditions.iter().any(|(known, _)| *known == condition) {
+            report.conditions.push((condition.clone(), shown));
+            report.conditions.sort_by_key(|known| natural(&known.0));
+        }
+        report.limits.extend(view.limit.map(|limit| (item.name.clone(), condition, limit)));
+    }
+    let folder = view.condition.replace([' ', '/'], "_");
+    for enhancing in enhancers {
+        let by = enhancing.by.to_string();
+        let frames = [enhancing.enhance(&view.frames[0])?, enhancing.enhance(&view.frames[1])?];
+        let place = Path::new(&by).join(&folder).join(format!("{}_flow.flo", item.name));
+        if let Some(root) = &how.write {
+            write(&root.join(&by).join(&folder), &item.name, &frames)?;
+        }
+        for method in methods.iter_mut().filter(|method| method.covers(&enhancing.by)) {
+            let shown = Shown { frames: [&frames[0], &frames[1]], place: &place };
+            let what = format!("{} by {} ({by}, {})", item.name, method.name, view.condition);
+            let found = match method.flow(&shown) {
+                Ok(found) => found,
+                // Others' results may be torn; a network that fails is no matter of one pair.
+                Err(nightflow::darkness::methods::Error::File(error)) => {
+                    report.skipped.push(Skipped { what, why: datasets::said(&error) });
+                    continue;
+                }
+                Err(error) => return Err(error).context(what),
+            };
+            for (truth, field) in &view.truths {
+                match score(&found, field) {
+                    Some(score) => {
+                        let condition = sorted(truth).0;
+                        report.records.push(Record::new(&item.name, &condition, &by, &method.name, score));
+                    }
+                    None => report.skipped.push(Skipped { what: what.clone(), why: mismatch(&found, field) }),
+                }
+            }
+        }
+        bar.inc(1);
+    }
+    Ok(())
+}
+
+fn mismatch(found: &Field, truth: &Field) -> String {
+    if (found.width, found.height) == (truth.width, truth.height) {
+        return "no pixel's truth is known".into();
+    }
+    format!("the flow is {}×{}, its truth {}×{}", found.width, found.height, truth.width, truth.height)
+}
+
+/// Sorts `exposure 2` before `exposure 10`.
+fn natural(name: &str) -> (String, u64) {
+    let letters = name.trim_end_matches(|letter: char| letter.is_ascii_digit());
+    (letters.to_owned(), name[letters.len()..].parse().unwrap_or(0))
+}
+
+fn write(folder: &Path, name: &str, frames: &[Picture; 2]) -> Result<()> {
+    std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+    for (frame, role) in frames.iter().zip(["img1", "img2"]) {
+        frame.write(&folder.join(format!("{name}_{role}.png")))?;
+    }
+    Ok(())
+}
+
+/// Prints the tables and writes them where that is asked for.
+fn publish(report: &Report, how: &How) -> Result<Exit> {
+    let markdown = report.markdown();
+    print!("{markdown}");
+    if let Some(folder) = &how.out {
+        std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+        let plot = report.plot().map_err(|error| anyhow::anyhow!("the plot can't be drawn: {error}"))?;
+        for (name, text) in
+            [("table.md", markdown), ("table.csv", report.csv()), ("table.json", report.json()?), ("epe.svg", plot)]
+        {
+            let path = folder.join(name);
+            std::fs::write(&path, text).with_context(|| path.display().to_string())?;
+        }
+    }
+    Ok(if report.skipped.is_empty() { Exit::Done } else { Exit::DataLost })
+}
+
+fn progress(steps: usize) -> Result<ProgressBar> {
+    let style = ProgressStyle::with_template("{bar:40} {pos} of {len} {msg}, {eta} left")?;
+    Ok(ProgressBar::with_draw_target(Some(steps as u64), ProgressDrawTarget::stderr_with_hz(5)).with_style(style))
+}

@@ -1,0 +1,283 @@
+//! What an evaluation found, as Markdown, CSV, JSON and a picture.
+
+use std::fmt::Write as _;
+
+use plotters::prelude::*;
+use serde::Serialize;
+
+use super::{
+    bound::Limit,
+    datasets::Skipped,
+    score::{Score, Spread},
+};
+
+/// One method on one pair.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Record {
+    /// The pair.
+    pub pair: String,
+    /// The exposure, the pass, or `all`.
+    pub condition: String,
+    /// What the frames went through.
+    pub enhancer: String,
+    /// The method.
+    pub model: String,
+    /// Mean end-point error, px.
+    pub epe: f64,
+    /// Part of outliers, 0…1.
+    pub fl_all: f64,
+    /// Mean angular error, degrees.
+    pub aae: f64,
+}
+
+impl Record {
+    /// A score with what it is of.
+    pub fn new(pair: &str, condition: &str, enhancer: &str, model: &str, score: Score) -> Self {
+        let Score { epe, fl_all, aae } = score;
+        let [pair, condition, enhancer, model] = [pair, condition, enhancer, model].map(str::to_owned);
+        Self { pair, condition, enhancer, model, epe, fl_all, aae }
+    }
+
+    fn method(&self) -> String {
+        if self.enhancer == "none" { self.model.clone() } else { format!("{} + {}", self.enhancer, self.model) }
+    }
+}
+
+/// Everything that is known after an evaluation.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Report {
+    /// What was run on what: lines of the header.
+    pub about: Vec<(String, String)>,
+    /// Conditions in their order, and how each is shown.
+    pub conditions: Vec<(String, String)>,
+    /// Scores.
+    pub records: Vec<Record>,
+    /// The Cramér–Rao bound: pair, condition, bound.
+    pub limits: Vec<(String, String, Limit)>,
+    /// What was left out.
+    pub skipped: Vec<Skipped>,
+}
+
+/// A measure: its title, its value in a record, and decimals.
+type Measure = (&'static str, fn(&Record) -> f64, usize);
+
+const MEASURES: [Measure; 3] = [
+    ("End-point error, px", |record| record.epe, 2),
+    ("Outliers (Fl-all: above 3 px and above 5 %), %", |record| 100.0 * record.fl_all, 1),
+    ("Angular error, degrees", |record| record.aae, 1),
+];
+
+impl Report {
+    /// Methods in the order in which they first came.
+    fn methods(&self) -> Vec<String> {
+        let mut methods: Vec<String> = vec![];
+        for method in self.records.iter().map(Record::method) {
+            if !methods.contains(&method) {
+                methods.push(method);
+            }
+        }
+        methods
+    }
+
+    fn spread(&self, condition: &str, method: &str, measure: fn(&Record) -> f64) -> Option<Spread> {
+        let here = self.records.iter().filter(|record| record.condition == condition && record.method() == method);
+        Spread::of(&here.map(measure).collect::<Vec<_>>())
+    }
+
+    fn limit(&self, condition: &str, of: fn(&Limit) -> f64) -> Option<Spread> {
+        let here = self.limits.iter().filter(|limit| limit.1 == condition);
+        Spread::of(&here.map(|limit| of(&limit.2)).collect::<Vec<_>>())
+    }
+
+    /// Tables for reading: the three measures, and how far above the bound each method is.
+    pub fn markdown(&self) -> String {
+        let mut text = String::new();
+        for (what, value) in &self.about {
+            let _ = writeln!(text, "- {what}: {value}");
+        }
+        let methods = self.methods();
+        for (title, measure, decimals) in MEASURES {
+            let limit = decimals == 2 && !self.limits.is_empty();
+            let _ = writeln!(text, "\n### {title} (mean ± standard error over pairs [pairs])\n");
+            self.heading(&mut text, &methods, if limit { &["limit, mean", "limit, median"] } else { &[] });
+            for (condition, shown) in &self.conditions {
+                let _ = write!(text, "| {shown} |");
+                for method in &methods {
+                    let _ = write!(text, " {} |", cell(self.spread(condition, method, measure), decimals));
+                }
+                if limit {
+                    for of in [|limit: &Limit| limit.epe, |limit: &Limit| limit.median] {
+                        let _ = write!(text, " {} |", cell(self.limit(condition, of), 3));
+                    }
+                }
+                text.push('\n');
+            }
+        }
+        if !self.limits.is_empty() {
+            let _ = writeln!(text, "\n### How far above the limit: mean end-point error over mean limit\n");
+            self.heading(&mut text, &methods, &[]);
+            for (condition, shown) in &self.conditions {
+                let limit = self.limit(condition, |limit| limit.epe).map(|limit| limit.mean);
+                let _ = write!(text, "| {shown} |");
+                for method in &methods {
+                    let mean = self.spread(condition, method, |record| record.epe).map(|spread| spread.mean);
+                    match (mean, limit) {
+                        (Some(mean), Some(limit)) if limit > 0.0 => {
+                            let _ = write!(text, " ×{:.1} |", mean / limit);
+                        }
+                        _ => text.push_str(" – |"),
+                    }
+                }
+                text.push('\n');
+            }
+        }
+        self.left_out(&mut text);
+        text
+    }
+
+    fn heading(&self, text: &mut String, methods: &[String], more: &[&str]) {
+        let columns: Vec<&str> = methods.iter().map(String::as_str).chain(more.iter().copied()).collect();
+        let _ = writeln!(text, "| | {} |\n|{}", columns.join(" | "), " --- |".repeat(columns.len() + 1));
+    }
+
+    fn left_out(&self, text: &mut String) {
+        if self.skipped.is_empty() {
+            return;
+        }
+        let _ = writeln!(text, "\n### Left out: {}\n", self.skipped.len());
+        for Skipped { what, why } in &self.skipped {
+            let _ = writeln!(text, "- {what}: {why}");
+        }
+    }
+
+    /// The mean table, one line a cell.
+    pub fn csv(&self) -> String {
+        let mut text =
+            String::from("condition,method,pairs,epe,epe_error,fl_all,aae,limit_epe,limit_rms,limit_median\n");
+        for (condition, _) in &self.conditions {
+            let limits = [|limit: &Limit| limit.epe, |limit: &Limit| limit.rms, |limit: &Limit| limit.median]
+                .map(|of| self.limit(condition, of).map_or(String::new(), |spread| format!("{:.5}", spread.mean)));
+            for method in self.methods() {
+                let [epe, fl, aae] = MEASURES.map(|(_, measure, _)| self.spread(condition, &method, measure));
+                if let (Some(epe), Some(fl), Some(aae)) = (epe, fl, aae) {
+                    let error = if epe.error.is_finite() { format!("{:.5}", epe.error) } else { String::new() };
+                    let _ = writeln!(
+                        text,
+                        "{},{},{},{:.5},{error},{:.5},{:.5},{}",
+                        quoted(condition),
+                        quoted(&method),
+                        epe.count,
+                        epe.mean,
+                        fl.mean / 100.0,
+                        aae.mean,
+                        limits.join(",")
+                    );
+                }
+            }
+        }
+        text
+    }
+
+    /// Every single figure.
+    pub fn json(&self) -> Result<String, serde_json::Error> {
+        let limits: Vec<_> = self
+            .limits
+            .iter()
+            .map(|(pair, condition, limit)| {
+                serde_json::json!({"pair": pair, "condition": condition, "epe": limit.epe, "rms": limit.rms,
+                    "median": limit.median})
+            })
+            .collect();
+        let skipped: Vec<_> =
+            self.skipped.iter().map(|left| serde_json::json!({"what": left.what, "why": left.why})).collect();
+        let about: serde_json::Map<_, _> =
+            self.about.iter().map(|(what, value)| (what.clone(), value.clone().into())).collect();
+        let conditions: Vec<&String> = self.conditions.iter().map(|(condition, _)| condition).collect();
+        serde_json::to_string_pretty(&serde_json::json!({
+            "about": about, "conditions": conditions, "records": self.records, "limits": limits, "skipped": skipped,
+        }))
+    }
+
+    /// End-point error against the condition, a line a method with a bar of one standard error; the bound is dashed.
+    pub fn plot(&self) -> Result<String, Box<dyn std::error::Error>> {
+        let mut svg = String::new();
+        {
+            let root = SVGBackend::with_string(&mut svg, (960, 560)).into_drawing_area();
+            root.fill(&WHITE)?;
+            self.draw(&root)?;
+            root.present()?;
+        }
+        Ok(svg)
+    }
+
+    fn draw(
+        &self,
+        root: &DrawingArea<SVGBackend<'_>, plotters::coord::Shift>,
+    ) -> Result<(), Box<dyn std::error::Error>> {
+        let methods = self.methods();
+        let epe = |condition: &str, method: &str| self.spread(condition, method, |record| record.epe);
+        let line = |of: &dyn Fn(&str) -> Option<Spread>| -> Vec<(f64, Spread)> {
+            let shown = self.conditions.iter().enumerate();
+            shown.filter_map(|(at, (condition, _))| Some((at as f64, of(condition)?))).collect()
+        };
+        let lines: Vec<_> = methods.iter().map(|method| line(&|condition| epe(condition, method))).collect();
+        let limit = line(&|condition| self.limit(condition, |limit| limit.epe));
+        let means = lines.iter().chain([&limit]).flatten().map(|(_, spread)| spread.mean).filter(|mean| *mean > 0.0);
+        let (low, high) = means.fold((f64::MAX, 0.0f64), |(low, high), mean| (low.min(mean), high.max(mean)));
+        let (low, high) = if high > 0.0 { (low / 1.4, high * 1.4) } else { (0.1, 10.0) };
+        let last = (self.conditions.len() as f64 - 1.0).max(1.0);
+        let mut chart = ChartBuilder::on(root)
+            .caption("end-point error, mean over pairs and one standard error", ("sans-serif", 18))
+            .margin(10)
+            .x_label_area_size(40)
+            .y_label_area_size(60)
+            .build_cartesian_2d(-0.2..last + 1.6, (low..high).log_scale())?;
+        let label = |at: &f64| {
+            let near = (at - at.round()).abs() < 1e-6 && *at >= 0.0;
+            near.then(|| self.conditions.get(at.round() as usize))
+                .flatten()
+                .map_or(String::new(), |(name, _)| name.clone())
+        };
+        chart
+            .configure_mesh()
+            .light_line_style(WHITE)
+            .x_labels(2 * self.conditions.len() + 4)
+            .x_label_formatter(&label)
+            .y_label_formatter(&|value| format!("{value:.2}"))
+            .y_desc("px")
+            .draw()?;
+        for (at, (name, points)) in methods.iter().zip(&lines).enumerate() {
+            let colour = Palette99::pick(at).to_rgba();
+            let drawn = points.iter().map(|(x, spread)| (*x, spread.mean));
+            let series = chart.draw_series(LineSeries::new(drawn, colour.stroke_width(2)).point_size(3))?;
+            series.label(name).legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], colour.stroke_width(2)));
+            let bars = points.iter().filter(|(_, spread)| spread.error.is_finite()).map(|(x, spread)| {
+                let ends = [spread.mean - spread.error, spread.mean + spread.error].map(|end| end.clamp(low, high));
+                PathElement::new([(*x, ends[0]), (*x, ends[1])], colour.stroke_width(1))
+            });
+            chart.draw_series(bars)?;
+        }
+        if !limit.is_empty() {
+            let drawn = limit.iter().map(|(x, spread)| (*x, spread.mean));
+            let series = chart.draw_series(DashedLineSeries::new(drawn, 6, 4, BLACK.stroke_width(2)))?;
+            series.label("limit").legend(|(x, y)| PathElement::new([(x, y), (x + 18, y)], BLACK.stroke_width(2)));
+        }
+        chart.configure_series_labels().border_style(BLACK.mix(0.3)).background_style(WHITE.mix(0.8)).draw()?;
+        Ok(())
+    }
+}
+
+/// `1.59 ± 0.33 [9]`; a single pair has no error.
+fn cell(spread: Option<Spread>, decimals: usize) -> String {
+    match spread {
+        None => "– [0]".into(),
+        Some(Spread { mean, error, count }) if error.is_finite() => {
+            format!("{mean:.decimals$} ± {error:.decimals$} [{count}]")
+        }
+        Some(Spread { mean, count, .. }) => format!("{mean:.decimals$} [{count}]"),
+    }
+}
+
+fn quoted(text: &str) -> String {
+    if text.contains([',', '"', '\n']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text.into() }
+}

@@ -1,0 +1,64 @@
+//! Any single graph of images, as others export them: an enhancer of one frame, or a network that takes two at once.
+
+use std::path::Path;
+
+use ort::{
+    session::{Session, builder::GraphOptimizationLevel},
+    value::TensorRef,
+};
+
+use crate::flow::{
+    Config, Error,
+    onnx::{environment, failed},
+};
+
+/// A graph whose inputs are images of one size and whose first output is taken.
+pub struct Graph {
+    session: Session,
+    file: String,
+    inputs: Vec<String>,
+}
+
+impl Graph {
+    /// Loads `path` with the runtime and the threads of the settings; it must have this many inputs.
+    pub fn open(config: &Config, path: &Path, inputs: usize) -> Result<Self, Error> {
+        let (environment, _) = environment(config)?;
+        let bytes = std::fs::read(path).map_err(|e| Error::Manifest { path: path.into(), reason: e.to_string() })?;
+        let doing = "set up a session";
+        let session = Session::builder(&environment)
+            .map_err(failed(doing))?
+            .with_intra_threads(config.threads.max(1))
+            .map_err(failed(doing))?
+            .with_deterministic_compute(true)
+            .map_err(failed(doing))?
+            .with_optimization_level(GraphOptimizationLevel::All)
+            .map_err(failed(doing))?
+            .commit_from_memory(&bytes)
+            .map_err(failed("load a graph"))?;
+        let file = path.display().to_string();
+        let found: Vec<String> = session.inputs().iter().map(|outlet| outlet.name().to_owned()).collect();
+        if found.len() != inputs {
+            let wanted = format!("{inputs} input{} of images, NCHW", if inputs == 1 { "" } else { "s" });
+            return Err(Error::Interface { file, wanted, found: format!("{}: {}", found.len(), found.join(", ")) });
+        }
+        Ok(Self { session, file, inputs: found })
+    }
+
+    /// Runs the graph on images of 3 × `height` × `width` values, in the order of its inputs; gives the shape and the
+    /// values of the first output.
+    pub fn run(&mut self, images: &[&[f32]], width: usize, height: usize) -> Result<(Vec<usize>, Vec<f32>), Error> {
+        let tensor = |image| TensorRef::from_array_view(([1, 3, height, width], image));
+        let mut inputs = Vec::with_capacity(images.len());
+        for (name, &image) in self.inputs.iter().zip(images) {
+            inputs.push((name.clone(), tensor(image).map_err(failed("take an image"))?));
+        }
+        let outputs = self.session.run(inputs).map_err(failed("run the graph"))?;
+        let (shape, values) = outputs[0].try_extract_tensor::<f32>().map_err(failed("give a result"))?;
+        Ok((shape.iter().map(|&length| length.max(0) as usize).collect(), values.to_vec()))
+    }
+
+    /// The file that it came from.
+    pub fn file(&self) -> &str {
+        &self.file
+    }
+}
