@@ -1,5 +1,7 @@
 """Pairs for training and judging: clean scenes made into dark raw frames by the FCDN recipe `paper`."""
 
+import struct
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -81,10 +83,70 @@ def read_flo(path: Path) -> np.ndarray:
     return flow
 
 
+class Stream:
+    """Pairs that `nightflow synth scenes --stream` makes, noise included; the layout is that of its
+    `darkness::scenes::stream`. `command` is the whole command line; the program waits while nobody reads."""
+
+    MAGIC, VERSION = b"NFPAIRS\0", 1
+
+    def __init__(self, command: list[str]):
+        # Unbuffered: records are read in one piece into the batch's own memory.
+        self.program = subprocess.Popen(command, stdout=subprocess.PIPE, bufsize=0)
+        head = self._read(bytearray(96))
+        magic, version, length, width, height, component, record = struct.unpack_from("<8s6I", head)
+        if (magic, version, length) != (self.MAGIC, self.VERSION, 96):
+            found = f"{magic!r}, version {version}, {length} bytes"
+            raise ValueError(f"expected a stream of {self.MAGIC!r}, version {self.VERSION}, 96 bytes, found {found}")
+        self.seed, self.first, self.count = struct.unpack_from("<3Q", head, 32)
+        self.recipe, self.preset = (head[at : at + 16].rstrip(b"\0").decode() for at in (56, 72))
+        self.height, self.width, self.left = height, width, self.count or None
+        frame = (height, width, 3)
+        self.record = np.dtype(
+            [("index", "<u8"), ("a", "<f4", 3), ("b", "<f4", 3), ("level", "<f4"), ("zero", "<u4")]
+            + [("older", "u1", frame), ("newer", "u1", frame)]
+            + [("flow", f"<f{component}", (height, width, 2)), ("valid", "u1", (height, width))]
+        )
+        if self.record.itemsize != record:
+            raise ValueError(f"expected records of {self.record.itemsize} bytes, found {record}")
+
+    def _read(self, memory):
+        view, at = memoryview(memory).cast("B"), 0
+        while at < len(view):
+            more = self.program.stdout.readinto(view[at:])
+            if not more:
+                raise EOFError(f"expected {len(view)} bytes, the stream ended after {at}")
+            at += more
+        return memory
+
+    def records(self, batch: int) -> np.ndarray:
+        """The next records as they are: index, a, b, level, older, newer, flow, valid."""
+        if self.left is not None:
+            batch, self.left = min(batch, self.left), self.left - min(batch, self.left)
+        if batch == 0:
+            raise EOFError(f"all {self.count} pairs of the stream were read")
+        records = np.empty(batch, self.record)
+        self._read(records.view("u1"))
+        return records
+
+    def batch(self, batch: int):
+        """Older, newer [B, 3, H, W] in 0...1, flow [B, 2, H, W], valid [B, 1, H, W] as 0 or 1, and level [B]."""
+        found = self.records(batch)
+        frames = (torch.from_numpy(found[name]).permute(0, 3, 1, 2).float().div_(255) for name in ("older", "newer"))
+        flow = torch.from_numpy(found["flow"].astype(np.float32)).permute(0, 3, 1, 2)
+        return *frames, flow, torch.from_numpy(found["valid"])[:, None].float(), torch.from_numpy(found["level"].copy())
+
+    def close(self):
+        """Lets go of the program, which then ends by itself."""
+        self.program.stdout.close()
+        self.program.wait()
+
+
 def public_pairs(folder: Path):
-    """Name, older, newer [1, 3, H, W] in 0...1 and flow [1, 2, H, W] of every `NAME_flow.flo` in a folder."""
+    """Name, older, newer [1, 3, H, W] in 0...1 and flow [1, 2, H, W] of every `NAME_flow.flo` in a folder: frames are
+    `NAME_img1` and `NAME_img2`, PNG or (as in FlyingChairs and FCDN) PPM."""
     for flow_file in sorted(folder.glob("*_flow.flo")):
         name = flow_file.name.removesuffix("_flow.flo")
-        frames = [np.asarray(Image.open(folder / f"{name}_img{i}.png").convert("RGB")) for i in (1, 2)]
+        ending = "png" if (folder / f"{name}_img1.png").exists() else "ppm"
+        frames = [np.asarray(Image.open(folder / f"{name}_img{i}.{ending}").convert("RGB")) for i in (1, 2)]
         older, newer = (torch.from_numpy(f.copy()).permute(2, 0, 1)[None].float() / 255 for f in frames)
         yield name, older, newer, torch.from_numpy(read_flo(flow_file)).permute(2, 0, 1)[None]

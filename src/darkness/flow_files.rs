@@ -17,7 +17,7 @@ use image::{Rgb, RgbImage};
 
 pub use self::{
     flo::{flo_bytes, parse_flo},
-    frames::{parse_frame, read_frame},
+    frames::{parse_frame, read_cutout, read_frame},
     kitti::{kitti_bytes, parse_kitti},
 };
 use crate::flow::wheel;

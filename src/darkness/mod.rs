@@ -21,5 +21,6 @@ pub mod raws;
 pub mod recipes;
 pub mod report;
 mod scene;
+pub mod scenes;
 pub mod score;
 mod surface;

@@ -21,6 +21,7 @@ mod recordings;
 mod results;
 mod road;
 mod ros2;
+mod scenes;
 mod show;
 mod soak;
 mod tidy;

@@ -1,12 +1,16 @@
 """Scenes and noise: the flow is exact, the noise is the one that is said, held-out photographs stay unseen."""
 
+import struct
+import sys
+
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from PIL import Image
 
 import scenes
-from pairs import HeldOut, MEAN_LEVEL, linear, noisy, read_flo
+from pairs import HeldOut, MEAN_LEVEL, Stream, linear, noisy, public_pairs, read_flo
 from scenes import Textures, homographies, mapped, scene
 
 
@@ -91,3 +95,60 @@ def test_flo_files_are_read_and_wrong_ones_refused(tmp_path):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(ValueError, match=message):
             read_flo(tmp_path / name)
+
+
+def stream_of(tmp_path, count, height=4, width=6, version=1):
+    """A command that writes a stream of the documented layout, and its records."""
+    head = struct.pack("<8s6I3Q", b"NFPAIRS\0", version, 96, width, height, 2, 40 + height * width * 11, 7, 100, count)
+    head += b"paper".ljust(16, b"\0") + b"mixed".ljust(16, b"\0") + bytes(8)
+    rng = np.random.default_rng(1)
+    body = b""
+    for index in range(count):
+        frames = rng.integers(0, 256, (2, height, width, 3), dtype=np.uint8)
+        flow = rng.integers(-40, 40, (height, width, 2)).astype("<f2")
+        valid = rng.integers(0, 2, (height, width), dtype=np.uint8)
+        body += struct.pack("<Q7fI", 100 + index, 1, 2, 3, 4, 5, 6, 10.5, 0)
+        body += frames.tobytes() + flow.tobytes() + valid.tobytes()
+    path = tmp_path / "stream"
+    path.write_bytes(head + body)
+    copy = "import shutil, sys; shutil.copyfileobj(open(sys.argv[1], 'rb'), sys.stdout.buffer)"
+    return [sys.executable, "-c", copy, str(path)], body
+
+
+def test_a_stream_becomes_batches_and_ends(tmp_path):
+    command, body = stream_of(tmp_path, 5)
+    stream = Stream(command)
+    assert (stream.recipe, stream.preset, stream.seed, stream.first, stream.count) == ("paper", "mixed", 7, 100, 5)
+    older, newer, flow, valid, level = stream.batch(2)
+    assert older.shape == newer.shape == (2, 3, 4, 6) and flow.shape == (2, 2, 4, 6) and valid.shape == (2, 1, 4, 6)
+    first = np.frombuffer(body[40 : 40 + 72], np.uint8).reshape(4, 6, 3)
+    assert torch.equal((older[0] * 255).round().byte(), torch.from_numpy(first.copy()).permute(2, 0, 1))
+    vectors = np.frombuffer(body[40 + 144 : 40 + 144 + 96], "<f2").reshape(4, 6, 2)
+    assert (flow[0].permute(1, 2, 0).numpy() == vectors).all() and (level == 10.5).all()
+    assert list(stream.records(9)["index"]) == [102, 103, 104]
+    with pytest.raises(EOFError, match="all 5 pairs"):
+        stream.records(1)
+    stream.close()
+
+
+def test_a_torn_or_foreign_stream_is_refused(tmp_path):
+    command, _ = stream_of(tmp_path, 2)
+    path = tmp_path / "stream"
+    path.write_bytes(path.read_bytes()[:-1])
+    stream = Stream(command)
+    with pytest.raises(EOFError, match="expected"):
+        stream.batch(2)
+    command, _ = stream_of(tmp_path, 1, version=2)
+    with pytest.raises(ValueError, match="version 2"):
+        Stream(command)
+
+
+def test_pairs_in_the_layout_of_flyingchairs_are_read(tmp_path):
+    flow = np.ones((2, 3, 2), np.float32)
+    (tmp_path / "00001_flow.flo").write_bytes(
+        np.float32(202021.25).tobytes() + np.array([3, 2], "<i4").tobytes() + flow.tobytes()
+    )
+    for i in (1, 2):
+        Image.fromarray(np.full((2, 3, 3), 60 * i, np.uint8)).save(tmp_path / f"00001_img{i}.ppm")
+    ((name, older, newer, read),) = public_pairs(tmp_path)
+    assert name == "00001" and read.shape == (1, 2, 2, 3) and (newer == 2 * older).all()

@@ -12,6 +12,7 @@ mod show;
 mod summary;
 mod synth;
 mod synth_fcdn;
+mod synth_scenes;
 mod watch;
 
 use std::process::ExitCode;
@@ -20,7 +21,7 @@ use clap::{ArgAction, Parser, Subcommand};
 use nightflow::{
     camera,
     config::Error as ConfigError,
-    darkness::{fcdn, flow_files},
+    darkness::{fcdn, flow_files, scenes},
     node,
 };
 
@@ -113,6 +114,7 @@ fn users_mistake(error: &anyhow::Error) -> bool {
                 Some(flow_files::Error::Content { .. } | flow_files::Error::Ending { .. })
             )
             || matches!(cause.downcast_ref(), Some(camera::Error::Settings(_)))
+            || cause.is::<scenes::Error>()
             || cause.downcast_ref::<fcdn::Error>().is_some_and(fcdn::Error::mistaken)
             || matches!(cause.downcast_ref(), Some(node::Error::Camera(camera::Error::Settings(_))))
             || cause

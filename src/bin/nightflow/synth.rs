@@ -31,6 +31,8 @@ pub enum Command {
     Pan(PanArgs),
     /// Turn clean pairs (FlyingChairs) into dark ones (FCDN).
     Fcdn(crate::synth_fcdn::Args),
+    /// Draw pairs with exact flow: photographs, cut-outs and shapes that fly, as in FlyingChairs or under a drone.
+    Scenes(crate::synth_scenes::Args),
 }
 
 /// A drone flies over a textured plane with standing obstacles; frames, gyro, range, true flow and true velocity.
@@ -123,6 +125,7 @@ pub fn run(command: Command) -> Result<()> {
         Command::Flight(args) => fly(&args),
         Command::Pan(args) => sweep(&args),
         Command::Fcdn(args) => crate::synth_fcdn::run(&args),
+        Command::Scenes(args) => crate::synth_scenes::run(&args),
     }
 }
 
@@ -302,7 +305,7 @@ fn finish(out: Writer, bar: &ProgressBar) -> Result<()> {
     Ok(())
 }
 
-fn size(text: &str) -> Result<[usize; 2], String> {
+pub fn size(text: &str) -> Result<[usize; 2], String> {
     let wrong = || format!("{text:?} is no size; expected columns x rows, as in 640x480");
     let (columns, rows) = text.split_once('x').ok_or_else(wrong)?;
     Ok([columns.parse().map_err(|_| wrong())?, rows.parse().map_err(|_| wrong())?])

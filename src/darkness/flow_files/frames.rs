@@ -2,7 +2,7 @@
 
 use std::{io::Cursor, path::Path};
 
-use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits, RgbImage};
+use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits, RgbImage, RgbaImage};
 
 use super::{Error, Flaw, SIDE_MAX, checked_size};
 
@@ -16,7 +16,13 @@ pub fn read_frame(path: &Path) -> Result<RgbImage, Error> {
     parse_frame(&bytes).map_err(Error::content(path))
 }
 
-/// The same from bytes in memory.
+/// Reads a picture with its transparency, 8 bits a channel; without any it is opaque.
+pub fn read_cutout(path: &Path) -> Result<RgbaImage, Error> {
+    let bytes = std::fs::read(path).map_err(Error::io(path))?;
+    Ok(parse_any(&bytes).map_err(Error::content(path))?.into_rgba8())
+}
+
+/// [`read_frame`] from bytes in memory.
 pub fn parse_frame(bytes: &[u8]) -> Result<RgbImage, Flaw> {
     Ok(parse_any(bytes)?.into_rgb8())
 }
