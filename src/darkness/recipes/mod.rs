@@ -26,7 +26,7 @@ pub enum Recipe {
     /// a = r·a₀ and b = r²·b₀, where (a₀, b₀) are a real camera's at some ISO
     /// ([`profiles`](super::profiles), each colour its own) and r = 0.4/m is the gain that brings a raw of mean m to 0.4.
     /// First comes a noise level, so spread that the paper's table 1 comes out ([`TABLE`]), then a camera and ISO out of
-    /// those that show such a level at some m of 0.001…0.4, evenly, and m is solved for.
+    /// those that show such a level at some m of about 0.001…0.4, evenly, and m is solved for.
     Paper,
     /// The authors' released script (2021, MIT): on the 8-bit scale z = x + N(0, (a·x + b)²), a ~ |N(0, 19.5/255)| and
     /// b ~ |N(0, 38.25)|, cut to whole numbers of 0…255; then times 1/N(1, 0.05) for each colour, cut again. No gamma.

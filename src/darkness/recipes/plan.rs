@@ -8,10 +8,13 @@ use super::super::{
 };
 
 /// Bytes of a strip: a whole number of pixels, of vectors of any width, and of blocks of draws.
-const STRIP: usize = 12 * BLOCK;
+pub(super) const STRIP: usize = 12 * BLOCK;
 const PIXELS: usize = STRIP / 3;
 /// Pixels of a frame that its noise level is predicted from.
 const SAMPLE: usize = 4096;
+/// The estimator of the noise level reads so much of the deviation that is there: the median over 585 pairs of 512×384
+/// made of 195 photographs, levels of 4 and more. The scatter that it takes for even leans to the right.
+const ESTIMATED: f64 = 0.955;
 /// Clean values of a colour are counted in so many equal steps.
 const BINS: usize = 48;
 
@@ -81,7 +84,8 @@ fn woven(colours: [f32; 3]) -> [f32; STRIP] {
 }
 
 impl Clean {
-    fn means(&self, bytes: &[u8; STRIP], means: &mut [f32; STRIP]) {
+    /// What the camera would see of a strip of bytes.
+    pub fn means(&self, bytes: &[u8; STRIP], means: &mut [f32; STRIP]) {
         looked_up(bytes, &self.curves, means);
         let Some(camera) = &self.camera else { return };
         let mut planes = [[0.0; PIXELS]; 3];
@@ -199,7 +203,7 @@ impl Spread {
             }
         }
         colours.sort_by(f64::total_cmp);
-        (colours.iter().sum::<f64>() / 3.0).min(colours[1]).sqrt()
+        (colours.iter().sum::<f64>() / 3.0).min(colours[1]).sqrt() * ESTIMATED
     }
 }
 

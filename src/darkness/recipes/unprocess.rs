@@ -73,7 +73,7 @@ fn inverse_smoothstep(y: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use super::{super::plan::STRIP, *};
 
     #[test]
     fn the_tone_curve_is_undone() {
@@ -94,6 +94,36 @@ mod tests {
             }
             // A camera's colours overlap: each keeps most of itself and takes from its neighbours.
             assert!((0..3).all(|i| matrix[i][i] > 0.4 && matrix[i][i] < 1.2), "{matrix:?}");
+        }
+    }
+
+    #[test]
+    fn colours_go_the_published_way() {
+        let mut bytes = [0; STRIP];
+        let pixels = bytes.as_chunks_mut::<3>().0;
+        for (at, pixel) in pixels.iter_mut().enumerate() {
+            // Every second pixel is near white, where the gains give way.
+            *pixel = [at * 7, at * 13 + 80, at * 29 + 160]
+                .map(|value| if at % 2 == 0 { value % 256 } else { 255 - value % 16 } as u8);
+        }
+        for pair in 0..5 {
+            let (plan, drawn) = plan(&mut Dice::new(1, pair), &bytes);
+            let matrix = plan.clean.camera.as_ref().unwrap().matrix.map(|row| row.map(f64::from));
+            let mut means = [0.0; STRIP];
+            plan.clean.means(&bytes, &mut means);
+            for (pixel, found) in bytes.as_chunks::<3>().0.iter().zip(means.as_chunks::<3>().0) {
+                let linear = pixel.map(|byte| {
+                    let y = f64::from(byte) / 255.0;
+                    (0.5 - ((1.0 - 2.0 * y).asin() / 3.0).sin()).powf(2.2)
+                });
+                let seen = matrix.map(|row| (0..3).map(|i| row[i] * linear[i]).sum::<f64>());
+                let mask = ((seen.iter().sum::<f64>() / 3.0 - 0.9).max(0.0) / 0.1).powi(2);
+                for colour in 0..3 {
+                    let gain = (mask + (1.0 - mask) * drawn.gain[colour]).max(drawn.gain[colour]);
+                    let expected = 255.0 * (seen[colour] * gain).clamp(0.0, 1.0);
+                    assert!((f64::from(found[colour]) - expected).abs() < 2e-3, "{pixel:?}: {found:?}, {expected}");
+                }
+            }
         }
     }
 }
