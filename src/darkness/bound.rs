@@ -14,7 +14,10 @@
 //!
 //! The patch has a side of [`PATCH`] pixels around each pixel, within which motion is taken to be one displacement. It
 //! bounds whoever looks no further; a network that takes motion from further around, and gets its smoothness right, may
-//! in principle fall below. Gradients are five-point differences of the picture without noise.
+//! in principle fall below. The mean is ruled by the few flat or saturated places, where the prior is all there is; the
+//! median says what a place with structure allows. Without noise a saturated place says nothing at all, and a little
+//! noise lifts some of its values out of saturation, so that the mean may be higher at the brightest exposure than at
+//! the next. Gradients are five-point differences of the picture without noise.
 
 use super::{flow_files::Field, ladder::Rung};
 

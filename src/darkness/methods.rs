@@ -133,9 +133,11 @@ impl Method {
         }
     }
 
-    /// Whether it can have anything for frames that went through this enhancer.
+    /// Whether it can have anything of its own for frames that went through this enhancer.
     pub fn covers(&self, enhancer: &Enhancer) -> bool {
         match &self.way {
+            // It looks at no frame.
+            Way::Zero => *enhancer == Enhancer::None,
             Way::Written(folder) => folder.join(enhancer.to_string()).is_dir(),
             _ => true,
         }

@@ -1,6 +1,6 @@
 //! What an evaluation found, as Markdown, CSV, JSON and a picture.
 
-use std::fmt::Write as _;
+use std::{collections::BTreeMap, fmt::Write as _};
 
 use plotters::prelude::*;
 use serde::Serialize;
@@ -81,12 +81,12 @@ impl Report {
 
     fn spread(&self, condition: &str, method: &str, measure: fn(&Record) -> f64) -> Option<Spread> {
         let here = self.records.iter().filter(|record| record.condition == condition && record.method() == method);
-        Spread::of(&here.map(measure).collect::<Vec<_>>())
+        over_pairs(here.map(|record| (record.pair.as_str(), measure(record))))
     }
 
     fn limit(&self, condition: &str, of: fn(&Limit) -> f64) -> Option<Spread> {
         let here = self.limits.iter().filter(|limit| limit.1 == condition);
-        Spread::of(&here.map(|limit| of(&limit.2)).collect::<Vec<_>>())
+        over_pairs(here.map(|limit| (limit.0.as_str(), of(&limit.2))))
     }
 
     /// Tables for reading: the three measures, and how far above the bound each method is.
@@ -265,6 +265,19 @@ impl Report {
         chart.configure_series_labels().border_style(BLACK.mix(0.3)).background_style(WHITE.mix(0.8)).draw()?;
         Ok(())
     }
+}
+
+/// Stands between a pair's name and the number of the draw of its noise.
+pub const DRAW: char = '~';
+
+/// Spread over pairs; several draws of one pair's noise are no further pairs, they are averaged first.
+fn over_pairs<'a>(values: impl Iterator<Item = (&'a str, f64)>) -> Option<Spread> {
+    let mut pairs: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+    for (name, value) in values {
+        pairs.entry(name.split(DRAW).next().unwrap_or(name)).or_default().push(value);
+    }
+    let means: Vec<f64> = pairs.values().map(|draws| draws.iter().sum::<f64>() / draws.len() as f64).collect();
+    Spread::of(&means)
 }
 
 /// `1.59 ± 0.33 [9]`; a single pair has no error.

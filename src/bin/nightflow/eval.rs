@@ -13,7 +13,7 @@ use nightflow::{
         ladder::{Linear, MEANS, Sensor},
         methods::{Enhancing, Method, Shown},
         picture::Picture,
-        report::{Record, Report},
+        report::{DRAW, Record, Report},
         score::score,
     },
     flow,
@@ -74,6 +74,9 @@ struct LadderArgs {
     /// The same seed gives the same bits.
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// How often each exposure is drawn; a pair's draws are averaged before the pairs are.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100))]
+    draws: u32,
     /// Side of the square that the limit is for, pixels, odd.
     #[arg(long, default_value_t = bound::PATCH)]
     patch: usize,
@@ -122,15 +125,21 @@ pub fn run(args: Args) -> Result<Exit> {
             }
             let sensor = Sensor::find(&ladder.camera, ladder.iso)?;
             let about = vec![
-                ("camera".to_owned(), format!("{} at ISO {}, seed {}", ladder.camera, ladder.iso, ladder.seed)),
+                (
+                    "camera".to_owned(),
+                    format!(
+                        "{} at ISO {}, seed {}, draws a pair: {}",
+                        ladder.camera, ladder.iso, ladder.seed, ladder.draws
+                    ),
+                ),
                 ("limit".to_owned(), format!("Cramér–Rao, a square of {0} × {0} pixels", ladder.patch)),
             ];
             let light = Light::Ladder { sensor, seed: ladder.seed, patch: ladder.patch };
-            evaluate(&ladder.pairs, &light, &ladder.how, about)
+            evaluate(&ladder.pairs, &light, &ladder.how, about, ladder.draws)
         }
         (None, Some(dataset)) => {
             let light = if args.linear { Light::Linear } else { Light::AsItIs };
-            evaluate(&dataset, &light, &args.how, vec![])
+            evaluate(&dataset, &light, &args.how, vec![], 1)
         }
         (None, None) => bail!("a data set's folder is needed"),
     }
@@ -152,7 +161,7 @@ struct View {
     limit: Option<bound::Limit>,
 }
 
-fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, String)>) -> Result<Exit> {
+fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, String)>, draws: u32) -> Result<Exit> {
     let Found { kind, mut items, mut skipped } = datasets::find(folder, how.layout)?;
     if kind == Kind::Vbof && matches!(light, Light::Ladder { .. }) {
         bail!("{} has been photographed in the dark already; a ladder wants bright sRGB pairs", folder.display());
@@ -172,6 +181,12 @@ fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, Str
     about.insert(0, ("data".into(), format!("{} ({layout}), {} pairs", folder.display(), items.len())));
     about.extend(methods.iter().map(|method| (method.name.clone(), method.about())));
     let mut report = Report { about, skipped, ..Report::default() };
+    // The name seeds the noise, so that another draw is the same pair by another name.
+    let again = |item: &Item, draw: u32| match draw {
+        0 => item.clone(),
+        _ => Item { name: format!("{}{DRAW}{draw}", item.name), ..item.clone() },
+    };
+    let items: Vec<Item> = items.iter().flat_map(|item| (0..draws).map(move |draw| again(item, draw))).collect();
     let rungs = if matches!(light, Light::Ladder { .. }) { MEANS.len() } else { 1 };
     let bar = progress(items.len() * rungs * enhancers.len())?;
     for item in &items {
