@@ -7,6 +7,7 @@ pub mod enhance;
 pub mod fcdn;
 pub mod flight;
 pub mod flow_files;
+pub mod foi;
 pub mod gaussians;
 pub mod ladder;
 pub mod level;

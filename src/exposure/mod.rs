@@ -15,6 +15,7 @@ mod error;
 mod gain;
 mod hot;
 mod layout;
+mod mosaic;
 mod reduce;
 mod rows;
 mod sums;
@@ -22,6 +23,7 @@ mod sums;
 pub use config::{Config, Justification, Packing, Pattern, REASONS};
 pub use develop::Developer;
 pub use error::Error;
+pub use mosaic::{Mosaic, Plane};
 
 /// A developed frame, ready for the network.
 ///

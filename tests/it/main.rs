@@ -15,6 +15,7 @@ mod live;
 mod motion;
 mod noise;
 mod onnx_bytes;
+mod noise_command;
 mod peers;
 mod recording;
 mod recordings;

@@ -5,6 +5,7 @@ mod config;
 mod doctor;
 mod eval;
 mod launch;
+mod noise;
 mod record;
 mod replay;
 mod run;
@@ -64,6 +65,9 @@ enum Command {
     /// Make recordings with known truth, and data sets for the dark.
     /// Judge methods on data sets with true flow, by exposure; climb down the brightness ladder.
     Eval(eval::Args),
+    /// Measure a camera's noise on its raw frames.
+    #[command(subcommand)]
+    Noise(noise::Command),
     /// Make recordings with known truth.
     #[command(subcommand)]
     Synth(synth::Command),
@@ -92,6 +96,7 @@ fn main() -> ExitCode {
         Command::Config(args) => config::run(args),
         Command::Show(args) => show::run(&args).map(|()| Exit::Done),
         Command::Eval(args) => eval::run(args),
+        Command::Noise(command) => noise::run(command).map(|()| Exit::Done),
         Command::Synth(command) => synth::run(command).map(|()| Exit::Done),
     };
     match ended {
