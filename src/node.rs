@@ -9,6 +9,7 @@ use std::{
 use crate::{
     camera::{self, Counts, Next, Sample, Source},
     clock::{self, Laps, Reservoir, Stage, Stopwatch},
+    exposure::Noise,
     flow::{Flow, Lender, Own, State},
     motion::Scale,
     pipeline::{Outcome, Pipeline},
@@ -133,6 +134,8 @@ pub struct Report {
     pub speeds: Reservoir,
     /// State of the newest step.
     pub state: State,
+    /// Of the newest step: the camera's noise, the raw mean, and the noise level in the network's image.
+    pub noise: Option<(Noise, f32, f32)>,
 }
 
 impl Report {
@@ -168,6 +171,7 @@ impl Report {
             Err(lack) => *self.lacks.entry(lack.kind().into()).or_default() += 1,
         }
         self.state = moved.state.clone();
+        self.noise = moved.noise.map(|noise| (noise, moved.raw_mean, moved.noise_level.unwrap_or(f32::NAN)));
     }
 
     fn status(&self, since: &Cadence) -> wire::Status {
@@ -178,6 +182,9 @@ impl Report {
             State::Degraded(cause) => (1, cause.to_string()),
             State::Blind(cause) => (2, cause.to_string()),
         };
+        let [noise_a, noise_b, snr_db, noise_level] = self.noise.map_or([f32::NAN; 4], |(noise, mean, level)| {
+            [noise.a as f32, noise.b as f32, noise.snr_db(mean.into()) as f32, level]
+        });
         let median = |series: &Reservoir| series.quantiles([0.5]).map_or(f32::NAN, |[ms]| ms as f32);
         wire::Status {
             header: wire::Header { stamp: clock::now().into(), frame_id: String::new() },
@@ -193,6 +200,10 @@ impl Report {
             rate: (self.steps - since.steps) as f32 / since.last.elapsed().as_secs_f32().max(1e-3),
             latency_ms: median(&self.latency_ms),
             step_ms: median(&self.step_ms),
+            noise_a,
+            noise_b,
+            snr_db,
+            noise_level,
         }
     }
 }

@@ -120,6 +120,8 @@ impl Pipeline {
             grid: flow.grid,
             gain: pair.newer.gain,
             raw_mean: pair.newer.raw_mean,
+            noise: pair.newer.noise,
+            noise_level: pair.newer.noise_level,
             saturated_part: pair.newer.saturated_part,
             confidence,
             state,

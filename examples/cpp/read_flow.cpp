@@ -24,7 +24,7 @@ struct FlowHeader {
     float scale_x;
     float scale_y;
     std::uint32_t state; // 0 ok, 1 degraded, 2 blind
-    std::uint32_t cause; // 0 none, 1 dark, 2 saturated, 3 gain step, 4 unsure, 5 frozen
+    std::uint32_t cause; // 0 none, 1 dark, 2 saturated, 3 gain step, 4 unsure, 5 frozen, 6 noisy
     float gain;
     float raw_mean;
     float saturated;

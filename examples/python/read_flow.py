@@ -28,7 +28,7 @@ class FlowHeader(ctypes.Structure):
         ("scale_x", ctypes.c_float),
         ("scale_y", ctypes.c_float),
         ("state", ctypes.c_uint32),  # 0 ok, 1 degraded, 2 blind
-        ("cause", ctypes.c_uint32),  # 0 none, 1 dark, 2 saturated, 3 gain step, 4 unsure, 5 frozen
+        ("cause", ctypes.c_uint32),  # 0 none, 1 dark, 2 saturated, 3 gain step, 4 unsure, 5 frozen, 6 noisy
         ("gain", ctypes.c_float),
         ("raw_mean", ctypes.c_float),
         ("saturated", ctypes.c_float),

@@ -7,6 +7,7 @@ use super::{
     gain::Law,
     hot,
     layout::{Container, Layout},
+    noise::Gauge,
     reduce::{Plan, Reducer, Target},
     rows::{self, Fingerprint, Found},
     sums,
@@ -35,6 +36,7 @@ pub struct Developer {
     spare: Kept,
     reducer: Option<(Layout, Reducer)>,
     counts: Vec<u16>,
+    gauge: Gauge,
     step: Option<f32>,
     generation: u64,
 }
@@ -52,6 +54,7 @@ impl Developer {
             spare: Kept::default(),
             reducer: None,
             counts: Vec::new(),
+            gauge: Gauge::default(),
             step: None,
             generation: 0,
         })
@@ -63,7 +66,9 @@ impl Developer {
     pub fn develop(&mut self, frame: &Frame) -> Result<(), Error> {
         let image = &frame.image;
         let layout = Layout::read(&self.config, image)?;
+        self.gauge.start(&layout, frame.stamp());
         self.reduce(&layout, image)?;
+        self.tell_noise(&layout, frame);
         self.name(frame);
         std::mem::swap(&mut self.older, &mut self.newer);
         std::mem::swap(&mut self.newer, &mut self.spare);
@@ -129,6 +134,16 @@ impl Developer {
         Ok(())
     }
 
+    /// Takes the gauge's reading, and what it means for a pixel of the developed image.
+    fn tell_noise(&mut self, layout: &Layout, frame: &Frame) {
+        let exposed = &mut self.spare.exposed;
+        exposed.noise = self.gauge.finish(layout, frame.stamp());
+        let cells = (layout.width / layout.stride() * (layout.height / layout.stride())) as f64;
+        // Of a cell's colours, green is the mean of two: the mean variance is 5/6 of one pixel's.
+        let pixels = cells / (exposed.width * exposed.height) as f64 * if layout.stride() == 2 { 1.2 } else { 1.0 };
+        exposed.noise_level = exposed.noise.map(|noise| noise.level(f64::from(exposed.raw_mean), pixels) as f32);
+    }
+
     /// The one pass over the camera's bytes.
     fn pass(&mut self, layout: &Layout, image: &Image, reducer: &mut Reducer) -> Seen {
         let mut target = Target { reduced: &mut self.spare.reduced, saturated: &mut self.spare.exposed.saturated };
@@ -149,6 +164,7 @@ impl Developer {
                 found.max = rows::measure(&self.counts, stride).max;
             }
             seen.max = seen.max.max(found.max);
+            self.gauge.take(y, &self.counts, stride, layout.white);
             if y < rows {
                 reducer.take(y, &self.counts, found.max, &mut target);
             }

@@ -16,6 +16,7 @@ mod gain;
 mod hot;
 mod layout;
 mod mosaic;
+mod noise;
 mod reduce;
 mod rows;
 mod sums;
@@ -24,6 +25,7 @@ pub use config::{Config, Justification, Packing, Pattern, REASONS};
 pub use develop::Developer;
 pub use error::Error;
 pub use mosaic::{Mosaic, Plane};
+pub use noise::Noise;
 
 /// A developed frame, ready for the network.
 ///
@@ -53,6 +55,10 @@ pub struct Exposed {
     pub gain: f32,
     /// Changes whenever `rgb` does, so that features computed from it can be kept.
     pub generation: u64,
+    /// The camera's noise as the newest frames show it; none before a frame was large enough to tell.
+    pub noise: Option<Noise>,
+    /// Deviation of the noise in a pixel of the developed image, in 1/255, once its mean is 0.4.
+    pub noise_level: Option<f32>,
     /// The frame before had another stamp and the same bytes: the camera repeats itself.
     pub frozen: bool,
 }

@@ -33,9 +33,13 @@ pub struct Config {
     pub gap_ms_max: f64,
     /// Run the network once at start and compare with the values that its exporter noted.
     pub golden_check: bool,
-    /// Below this mean above black (1 = white) there is no trustworthy flow.
+    /// Above this noise (1/255 in the developed image at a mean of 0.4) there is no trustworthy flow.
+    pub noise_level_max: f32,
+    /// Above this noise flow is to be used with care.
+    pub noise_level_degraded: f32,
+    /// Below this mean above black (1 = white) there is no trustworthy flow, where the noise is not known.
     pub raw_mean_min: f32,
-    /// Below this mean above black flow is to be used with care.
+    /// Below this mean above black flow is to be used with care, where the noise is not known.
     pub raw_mean_degraded: f32,
     /// Above this saturated part of either frame there is no trustworthy flow.
     pub saturated_part_max: f32,
@@ -57,6 +61,8 @@ impl Default for Config {
             resolution: Resolution::Quarter,
             gap_ms_max: 150.0,
             golden_check: true,
+            noise_level_max: 60.0,
+            noise_level_degraded: 30.0,
             raw_mean_min: 0.001,
             raw_mean_degraded: 0.002,
             saturated_part_max: 0.5,
@@ -85,6 +91,11 @@ pub const REASONS: &[(&str, &str)] = &[
     ),
     ("gap_ms_max", "150: four lost frames at 30 Hz; beyond, a drone's motion leaves the reach of the cost volumes"),
     ("golden_check", "a runtime that computes something else is found at start, for the price of one small pair"),
+    ("noise_level_max", "60: twice what the network is trained for; signal and noise are then as strong as each other"),
+    (
+        "noise_level_degraded",
+        "30: the strongest noise that the network is trained for; it means the same by day, by night and for every camera",
+    ),
     ("raw_mean_min", "0.001: half of the darkest raw mean that the network is trained for (0.002)"),
     ("raw_mean_degraded", "0.002: the darkest raw mean that the network is trained for"),
     ("saturated_part_max", "0.5: over half of the vectors would stand on pixels that say nothing"),

@@ -120,6 +120,14 @@ pub enum Cause {
         /// The limit.
         needed: f32,
     },
+    /// Too much noise for the light there is.
+    #[error("too noisy: level {level:.1} of 255 at normal brightness, at most {allowed:.1} may be")]
+    Noisy {
+        /// Deviation in the developed image at a mean of 0.4, in 1/255.
+        level: f32,
+        /// The limit.
+        allowed: f32,
+    },
     /// Too much light.
     #[error("{part:.2} of the image is saturated, at most {allowed:.2} may be")]
     Saturated {

@@ -19,14 +19,20 @@ impl Matcher {
         let config = &self.config;
         let raw_mean = worse(pair.older.raw_mean, pair.newer.raw_mean, f32::min);
         let part = worse(pair.older.saturated_part, pair.newer.saturated_part, f32::max);
-        let dark = |needed| unless(raw_mean >= needed, Cause::Dark { raw_mean, needed });
+        // How noisy a picture is tells of the dark what its raw mean only hints at, and means the same for every camera.
+        let level =
+            pair.older.noise_level.zip(pair.newer.noise_level).map(|(older, newer)| worse(older, newer, f32::max));
+        let dark = |needed, allowed| match level {
+            Some(level) => unless(level <= allowed, Cause::Noisy { level, allowed }),
+            None => unless(raw_mean >= needed, Cause::Dark { raw_mean, needed }),
+        };
         let saturated = |allowed| unless(part <= allowed, Cause::Saturated { part, allowed });
         let unsure = |needed| unless(mean >= needed, Cause::Unsure { mean, needed });
         let blind = pair
             .newer
             .frozen
             .then_some(Cause::Frozen)
-            .or_else(|| dark(config.raw_mean_min))
+            .or_else(|| dark(config.raw_mean_min, config.noise_level_max))
             .or_else(|| saturated(config.saturated_part_max))
             .or_else(|| unsure(config.confidence_min));
         if let Some(cause) = blind {
@@ -35,7 +41,7 @@ impl Matcher {
         let degraded = pair
             .gain_step
             .map(|factor| Cause::GainStep { factor })
-            .or_else(|| dark(config.raw_mean_degraded))
+            .or_else(|| dark(config.raw_mean_degraded, config.noise_level_degraded))
             .or_else(|| saturated(config.saturated_part_degraded))
             .or_else(|| unsure(config.confidence_degraded));
         degraded.map_or(State::Ok, State::Degraded)

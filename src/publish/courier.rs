@@ -337,6 +337,8 @@ mod tests {
             grid: flow::Grid::default(),
             gain: 1.0,
             raw_mean: 0.0,
+            noise: None,
+            noise_level: None,
             saturated_part: 0.0,
             confidence: 0.0,
             state: flow::State::Ok,

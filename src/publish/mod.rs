@@ -42,6 +42,10 @@ pub struct Moved {
     pub gain: f32,
     /// Mean above black of the newer frame, 1 = white.
     pub raw_mean: f32,
+    /// The camera's noise, once it is known.
+    pub noise: Option<crate::exposure::Noise>,
+    /// Deviation of the noise in the developed newer frame at a mean of 0.4, in 1/255.
+    pub noise_level: Option<f32>,
     /// Part of the newer frame that is saturated.
     pub saturated_part: f32,
     /// Mean confidence of the flow.

@@ -121,13 +121,21 @@ pub struct StatusSample {
     pub latency_ms: f32,
     /// Median of a step.
     pub step_ms: f32,
+    /// Noise of a raw value y (1 = white): its variance is noise_a·y + noise_b; NaN when unknown, as all four.
+    pub noise_a: f32,
+    /// See `noise_a`.
+    pub noise_b: f32,
+    /// Signal to noise of a raw pixel at the newest frame's mean.
+    pub snr_db: f32,
+    /// Deviation of the noise in the network's image at a mean of 0.4, in 1/255.
+    pub noise_level: f32,
     /// UTF-8, filled up with zeros, cut where it is longer.
     pub cause: [u8; 128],
     /// UTF-8, filled up with zeros, cut where it is longer.
     pub last_error: [u8; 256],
 }
 
-/// [`FlowHeader::cause`]: 0 none, 1 dark, 2 saturated, 3 gain step, 4 unsure, 5 frozen.
+/// [`FlowHeader::cause`]: 0 none, 1 dark, 2 saturated, 3 gain step, 4 unsure, 5 frozen, 6 noisy.
 pub fn cause_code(state: &State) -> u32 {
     match state {
         State::Ok => 0,
@@ -137,6 +145,7 @@ pub fn cause_code(state: &State) -> u32 {
             Cause::GainStep { .. } => 3,
             Cause::Unsure { .. } => 4,
             Cause::Frozen => 5,
+            Cause::Noisy { .. } => 6,
         },
     }
 }
@@ -158,7 +167,7 @@ pub fn lack_code(velocity: &Result<Velocity, Lack>) -> u32 {
 
 /// What a code of [`FlowHeader::cause`] stands for.
 pub fn cause_name(code: u32) -> &'static str {
-    ["", "dark", "saturated", "gain step", "unsure", "frozen"].get(code as usize).copied().unwrap_or("unknown")
+    ["", "dark", "saturated", "gain step", "unsure", "frozen", "noisy"].get(code as usize).copied().unwrap_or("unknown")
 }
 
 /// What a code of [`VelocitySample::lack`] stands for.
@@ -252,6 +261,10 @@ impl From<&wire::Status> for StatusSample {
             rate: status.rate,
             latency_ms: status.latency_ms,
             step_ms: status.step_ms,
+            noise_a: status.noise_a,
+            noise_b: status.noise_b,
+            snr_db: status.snr_db,
+            noise_level: status.noise_level,
             cause: text(&status.cause),
             last_error: text(&status.last_error),
         }
@@ -291,7 +304,7 @@ mod tests {
     fn layouts_are_those_that_the_other_languages_declare() {
         assert_eq!((size_of::<FlowHeader>(), align_of::<FlowHeader>()), (96, 8));
         assert_eq!((size_of::<VelocitySample>(), align_of::<VelocitySample>()), (408, 8));
-        assert_eq!((size_of::<StatusSample>(), align_of::<StatusSample>()), (456, 8));
+        assert_eq!((size_of::<StatusSample>(), align_of::<StatusSample>()), (472, 8));
     }
 
     #[test]

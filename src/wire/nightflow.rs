@@ -65,6 +65,10 @@ pub struct Status {
     pub rate: f32,
     pub latency_ms: f32,
     pub step_ms: f32,
+    pub noise_a: f32,
+    pub noise_b: f32,
+    pub snr_db: f32,
+    pub noise_level: f32,
 }
 
 impl Message for Status {

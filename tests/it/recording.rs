@@ -93,6 +93,8 @@ pub fn moved(step: u64, state: State) -> Moved {
         grid: Grid { width: 4, height: 2, scale: [4.0, 4.0] },
         gain: 20.0,
         raw_mean: 0.02,
+        noise: None,
+        noise_level: None,
         saturated_part: 0.0,
         confidence: 0.75,
         state,

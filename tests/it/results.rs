@@ -88,6 +88,8 @@ fn moved(step: u64) -> Moved {
         grid: GRID,
         gain: 20.0,
         raw_mean: 0.02,
+        noise: None,
+        noise_level: None,
         saturated_part: 0.01,
         confidence: 0.75,
         state,
@@ -110,5 +112,9 @@ fn status() -> Status {
         rate: 30.5,
         latency_ms: 12.25,
         step_ms: 8.0,
+        noise_a: 0.25,
+        noise_b: -0.125,
+        snr_db: 6.5,
+        noise_level: 12.0,
     }
 }

@@ -181,6 +181,10 @@ class Status(IdlStruct, typename=named("nightflow_msgs", "Status")):
     rate: t.float32
     latency_ms: t.float32
     step_ms: t.float32
+    noise_a: t.float32
+    noise_b: t.float32
+    snr_db: t.float32
+    noise_level: t.float32
 
 
 def participant(domain):

@@ -111,6 +111,8 @@ class Results:
         assert counters == (2**40, 2, 3, 4, 5, 6), message
         assert message.last_error == "short by 3 bytes", message
         assert (message.rate, message.latency_ms, message.step_ms) == (30.5, 12.25, 8.0), message
+        noise = (message.noise_a, message.noise_b, message.snr_db, message.noise_level)
+        assert noise == (0.25, -0.125, 6.5, 12.0), message
 
     def diagnostics(self, message):
         [status] = message.status

@@ -30,6 +30,8 @@ fn moved(step: u64, grid: Grid) -> Moved {
         grid,
         gain: 2.0,
         raw_mean: 0.1,
+        noise: None,
+        noise_level: None,
         saturated_part: 0.0,
         confidence: 0.5,
         state: State::Blind(Cause::Frozen),
