@@ -42,7 +42,7 @@ const THING: Motion = Motion {
 /// How often a motion is seen in perspective.
 const TILTED: f64 = 0.35;
 /// Half of a thing's size: mean, deviation, least and most, as parts of the square root of the frame's area.
-const RADIUS: [f64; 4] = [0.08, 0.075, 0.035, 0.4];
+const RADIUS: [f64; 4] = [0.07, 0.07, 0.035, 0.4];
 /// What reaches farther than this part of the frame's width turns and grows the less for it.
 const CALM: f64 = 0.28;
 

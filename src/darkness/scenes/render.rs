@@ -55,7 +55,7 @@ pub(super) fn render(index: u64, size: [usize; 2], layers: &[Layer<'_>]) -> Pair
 
 impl Canvas {
     fn bytes(&self) -> Vec<u8> {
-        self.pixels.iter().flatten().map(|value| (value + 0.5).clamp(0.0, 255.0) as u8).collect()
+        self.pixels.as_flattened().iter().map(|value| (value + 0.5).clamp(0.0, 255.0) as u8).collect()
     }
 
     /// The rectangle that a layer can cover: first and last column, first and last row.
@@ -97,7 +97,7 @@ impl Canvas {
         }
         let soft = distance < room;
         let Fill { texture, place: [px, py], tint } = &layer.fill;
-        let lod = (footprint * px[0].hypot(py[0])).log2();
+        let lod = (footprint * (px[0] * px[0] + py[0] * py[0]).sqrt()).log2();
         let sharp = 1.0 / footprint;
         for column in columns {
             let Some([x, y]) = line.at(column as f32) else { continue };
@@ -148,7 +148,7 @@ impl Line {
         let inverse = 1.0 / (self.across[2] * column + self.at_nought[2]);
         let grow = |step: &[f32; 3]| [(step[0] - x * step[2]) * inverse, (step[1] - y * step[2]) * inverse];
         let ([ax, ay], [dx, dy]) = (grow(&self.across), grow(&self.down));
-        let (across, down) = (ax.hypot(ay), dx.hypot(dy));
+        let (across, down) = ((ax * ax + ay * ay).sqrt(), (dx * dx + dy * dy).sqrt());
         [across, 0.5 * (across.max(down) + (ax * dy - ay * dx).abs().sqrt()).max(1e-4)]
     }
 }

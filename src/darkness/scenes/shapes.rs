@@ -197,7 +197,8 @@ impl Distances {
     fn at(&self, x: f32, y: f32) -> f32 {
         let most = self.reach * 0.9999;
         let (inner_x, inner_y) = (x.clamp(-most, most), y.clamp(-most, most));
-        let beyond = (x - inner_x).hypot(y - inner_y);
+        let (over_x, over_y) = (x - inner_x, y - inner_y);
+        let beyond = (over_x * over_x + over_y * over_y).sqrt();
         let scale = (self.side - 1) as f32 / (2.0 * self.reach);
         let (x, y) = ((inner_x + self.reach) * scale, (inner_y + self.reach) * scale);
         let (column, row) = ((x as usize).min(self.side - 2), (y as usize).min(self.side - 2));

@@ -99,9 +99,20 @@ pub fn append(pair: &Pair, precision: Precision, bytes: &mut Vec<u8>) {
     }
     bytes.extend(&pair.older);
     bytes.extend(&pair.newer);
+    let (begin, components) = (bytes.len(), pair.flow.as_flattened());
+    bytes.resize(begin + components.len() * precision.bytes(), 0);
+    let room = &mut bytes[begin..];
     match precision {
-        Precision::Half => bytes.extend(pair.flow.as_flattened().iter().flat_map(|value| half(*value).to_le_bytes())),
-        Precision::Single => bytes.extend(pair.flow.as_flattened().iter().flat_map(|value| value.to_le_bytes())),
+        Precision::Half => {
+            room.as_chunks_mut()
+                .0
+                .iter_mut()
+                .zip(components)
+                .for_each(|(two, value)| *two = half(*value).to_le_bytes());
+        }
+        Precision::Single => {
+            room.as_chunks_mut().0.iter_mut().zip(components).for_each(|(four, value)| *four = value.to_le_bytes());
+        }
     }
     bytes.extend(pair.valid.iter().map(|valid| u8::from(*valid)));
 }

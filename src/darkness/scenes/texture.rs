@@ -6,6 +6,8 @@ use image::{RgbaImage, imageops};
 pub(super) const SIDE: u32 = 512;
 /// A copy is no smaller than this.
 const LEAST: usize = 4;
+/// Texture pixels; nothing is looked up beyond.
+const FARTHEST: f32 = 1e6;
 
 /// A picture and its halved copies.
 #[derive(Debug, Clone)]
@@ -85,6 +87,8 @@ impl Texture {
         let lod = lod.clamp(0.0, most);
         let low = lod as usize;
         let part = lod - low as f32;
+        // What lies towards the horizon is far beyond any picture, and its place has to fit a whole number.
+        let (x, y) = (x.clamp(-FARTHEST, FARTHEST), y.clamp(-FARTHEST, FARTHEST));
         let fine = self.level(low, x, y);
         if part < 0.02 || low + 1 >= self.levels.len() {
             return fine;
@@ -98,9 +102,8 @@ impl Texture {
         let level = &self.levels[number];
         let scale = 1.0 / (1_u32 << number) as f32;
         let (x, y) = ((x + 0.5) * scale - 0.5, (y + 0.5) * scale - 0.5);
-        let (left, top) = (x.floor(), y.floor());
-        let (fx, fy) = (x - left, y - top);
-        let (column, row) = (left as i32, top as i32);
+        let (column, row) = (floor(x), floor(y));
+        let (fx, fy) = (x - column as f32, y - row as f32);
         let (w, h) = (level.width as i32, level.height as i32);
         let [a, b, c, d] = if column >= 0 && row >= 0 && column + 1 < w && row + 1 < h {
             let at = row as usize * level.width + column as usize;
@@ -162,6 +165,13 @@ impl Level {
         };
         self.pixels[fold(row, self.height) * self.width + fold(column, self.width)]
     }
+}
+
+/// The next whole number below; without SSE 4.1 the library's own is a call.
+#[inline(always)]
+fn floor(value: f32) -> i32 {
+    let whole = value as i32;
+    whole - i32::from(value < whole as f32)
 }
 
 fn sized(image: RgbaImage, side: u32) -> RgbaImage {
