@@ -2,7 +2,8 @@
 //!
 //! Motion is drawn by the law of Dosovitskiy et al. 2015: with probability p a figure is
 //! clamp(µ + sign(γ)·|γ|^k, a, b) of γ ~ N(0, σ), else it is µ. A thing's motion is its own, about its middle, on top of the
-//! background's. What is added to theirs: a mild perspective, holes, thin things, and repeated textures.
+//! background's. The form and its figures were not at hand to be checked against the paper's text; over 100 pairs they
+//! give a mean of 14.3 px and a median of 7.1, where five public pairs of FlyingChairs have 9.3 and 4.7. What is added to theirs: a mild perspective, holes, thin things, and repeated textures.
 
 use std::f64::consts::TAU;
 
