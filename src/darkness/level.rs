@@ -9,6 +9,10 @@
 //! same brightness the tenth with the least energy in the ten lowest frequencies. The noise is then taken from the
 //! other frequencies, where the choice has left white noise as it was.
 //!
+//! On 65 photographs (512 pixels, sharp, 8 bits) with levels from 0 to 30 added, in 255ths: three planes, bias −0.36
+//! (at 30) to +0.17 (at 0), worst 0.74, the same linearised within 0.94; one plane, median error 0.09 to 0.77, but up
+//! to 12 where no part of the picture is smooth.
+//!
 //! What it can't know: noise that depends on the signal counts with about its mean variance over the image; noise that
 //! was clipped, averaged with its neighbours (a demosaiced image) or compressed looks weaker than it was.
 
@@ -73,7 +77,8 @@ pub enum Error {
 /// The noise's standard deviation in one plane (`height` × `width`), in the unit of the values: for an image in 0…1,
 /// 255 times this is the level on the 8-bit scale that the paper's table 1 counts in.
 ///
-/// On textured pictures the error is below one 255th from level 0 to 30; what bias there is stands in the test.
+/// Right to one 255th from level 0 to 30 where some part of the picture is smooth; texture everywhere passes for noise, and
+/// [`noise_level_rgb`] tells the two apart far better.
 pub fn noise_level(plane: &[f32], width: usize, height: usize) -> Result<f64, Error> {
     level(&[plane], width, height)
 }

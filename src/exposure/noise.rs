@@ -2,9 +2,10 @@
 //!
 //! Pairs of rows far apart are cut into blocks of two times eight pixels of one colour. Each block gives its brightness
 //! twice, from pixels of its own each time, a step between its halves, and two details (third differences along the rows,
-//! one row less the other), which hold noise and little else; for white noise all of these are independent. Blocks are sorted by the one brightness into sets, the third of a set with the
-//! least steps is kept, and the median of its details is the noise at the mean of the other brightness. So neither the
-//! sorting nor the choice changes what is measured. What the sets say is fitted by a line.
+//! one row less the other), which hold noise and little else; for white noise all of these are independent. Blocks are
+//! sorted by the one brightness into sets, the third of a set with the least steps is kept, and the median of its details
+//! is the noise at the mean of the other brightness. So neither the sorting nor the choice changes what is measured. What
+//! the sets say is fitted by a line.
 //!
 //! The laboratory's way (`darkness::foi`) is sharper and a hundred times as dear.
 

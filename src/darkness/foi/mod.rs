@@ -3,6 +3,18 @@
 //! The diagonal detail of a wavelet holds noise and little else. It is sorted by brightness into level sets, the smooth
 //! part of each gives the noise's deviation there by a median, and the line through all is fitted by maximum likelihood
 //! with clipping at either end taken into account.
+//!
+//! How right it is, with 49 photographs linearised and enlarged by so many times (a sensor samples finer than its lens
+//! resolves, and 8-bit photographs of 512 pixels don't), 960×720, 14 bits, 200 draws of a from 1e-6 to 4e-3, b/a from 1e-4
+//! to 0.06 and four stops of exposure; errors are medians, b where b > 0.02·a (41 draws):
+//!
+//! | content | a: error, bias | b: error, bias | bounds hold a, b |
+//! | --- | --- | --- | --- |
+//! | enlarged 3 times | 2.1 %, −0.3 % | 2.2 %, 0.0 % | 0.94, 0.96 |
+//! | enlarged 2 times | 3.4 %, +1.1 % | 1.9 %, +0.2 % | 0.77, 0.85 |
+//! | as they are, sharp to the pixel | 18.6 %, +8.4 % | 5.1 %, −0.1 % | 0.43, 0.73 |
+//!
+//! What is as sharp as its pixels can't be told from noise: there the misfit rises above 1, and the bounds are too narrow.
 
 mod clip;
 mod fit;
