@@ -4,7 +4,7 @@
 
 use std::{
     fs,
-    path::{Path, PathBuf},
+    path::Path,
     process::{Command, ExitCode},
     time::Instant,
 };
@@ -14,6 +14,12 @@ use nightflow::darkness::{
     recipes::Recipe,
 };
 use rayon::prelude::*;
+
+// The other benches use the rest.
+#[allow(dead_code)]
+mod rivals;
+
+use rivals::python;
 
 const SIZE: [usize; 2] = [512, 384];
 const PAIRS: usize = 120;
@@ -81,7 +87,7 @@ fn frames_alone(recipe: Recipe, pairs: &[Pair], to: &Path) {
 }
 
 /// Runs the rival's ways over the same pairs: milliseconds a pair by name.
-fn rivals(from: &Path, to: &Path, cores: usize) -> Result<Vec<(String, f64)>, String> {
+fn run_rivals(from: &Path, to: &Path, cores: usize) -> Result<Vec<(String, f64)>, String> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/rivals/fcdn.py");
     let output = Command::new(python()?)
         .arg(script)
@@ -98,23 +104,6 @@ fn rivals(from: &Path, to: &Path, cores: usize) -> Result<Vec<(String, f64)>, St
         Some((name.to_owned(), time.trim().parse().ok()?))
     };
     Ok(printed.lines().filter_map(line).collect())
-}
-
-/// A Python with what the rivals import, installed once under `target/rivals`.
-fn python() -> Result<PathBuf, String> {
-    let rivals = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/rivals");
-    let home = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/rivals");
-    let python = home.join("bin/python");
-    let run = |command: &mut Command| match command.status() {
-        Ok(status) if status.success() => Ok(()),
-        Ok(status) => Err(format!("{command:?} ended with {status}")),
-        Err(error) => Err(format!("{command:?}: {error}")),
-    };
-    if !python.is_file() {
-        run(Command::new("python3").args(["-m", "venv"]).arg(&home))?;
-    }
-    run(Command::new(&python).args(["-m", "pip", "install", "-q", "-r"]).arg(rivals.join("requirements.txt")))?;
-    Ok(python)
 }
 
 fn compare(home: &Path) -> Result<(), String> {
@@ -159,7 +148,7 @@ fn compare(home: &Path) -> Result<(), String> {
         );
         ours.push((recipe, frames[0], whole[0]));
     }
-    let rivals = rivals(&from, &theirs, cores)?;
+    let rivals = run_rivals(&from, &theirs, cores)?;
     let copy = rivals.iter().find(|(name, _)| name == "copy_flow").map_or(0.0, |(_, time)| *time);
     for (name, time) in rivals {
         let against = if name == "authors_script" { Recipe::Authors2021 } else { Recipe::Paper };
