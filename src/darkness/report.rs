@@ -231,7 +231,8 @@ impl Report {
             .margin(10)
             .x_label_area_size(40)
             .y_label_area_size(60)
-            .build_cartesian_2d(-0.2..last + 1.6, (low..high).log_scale())?;
+            // The legend takes a quarter of the width, right of the last condition.
+            .build_cartesian_2d(-0.2..(last + 0.5) / 0.75, (low..high).log_scale())?;
         let label = |at: &f64| {
             let near = (at - at.round()).abs() < 1e-6 && *at >= 0.0;
             near.then(|| self.conditions.get(at.round() as usize))
