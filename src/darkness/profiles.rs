@@ -3,10 +3,10 @@
 //! The figures are those of darktable's noise profiles (`noiseprofiles.json`), read out for the cameras of the paper
 //! and some others: variance a·x + b of a raw value x in 0…1, for red, green and blue.
 //!
-//! **They are milder than the sensors are**, by two to four times in deviation where we could look. The Canon EOS 30D at ISO
-//! 640 (`nightflow noise measure recordings/real_raw_pan.mcap`, first frame, which is the sensor as shot) has a = 1.06e-4,
-//! 1.12e-4 and 1.30e-4 in red, green and blue with bounds of ±20 to 30 %, where the profile says 3.0e-5, 1.4e-5 and 2.0e-5;
-//! its masked columns have b = 4.7e-7, where the profile says less than 0 in red and green. darktable's tool
+//! **They are milder than the sensors are**, by two to three times in deviation where we could look. A raw of the Canon EOS
+//! 30D at ISO 640 (`nightflow noise measure canon30d_iso640.cr2`) has a = 1.39e-4, 1.40e-4 and 1.43e-4 in red, green and blue,
+//! each to 6 %, where the profile says 3.0e-5, 1.4e-5 and 2.0e-5, and b = 3e-7 to 8e-7 (its masked columns: 4.7e-7), where the
+//! profile says less than 0 in red and green: at the planes' means 2.2, 3.3 and 2.1 times its deviation. darktable's tool
 //! (`tools/noise/noiseprofile.c`) does not measure the raw values. It takes the diagonal detail of a Haar transform that
 //! halves where it should divide by √2, twice: the deviation comes out half as large (darktable issue 4411). And it does
 //! so after demosaicing, where most pixels are means of their neighbours, and after the input colour profile: the finest

@@ -161,7 +161,8 @@ fn photograph(path: &Path) -> Result<Shot> {
     let (decoder, params) = (rawler::get_decoder(&source)?, RawDecodeParams::default());
     let raw = decoder.raw_image(&source, &params, false).with_context(|| shown.clone())?;
     let exif = decoder.raw_metadata(&source, &params).map(|known| known.exif).ok();
-    let iso = exif.and_then(|exif| exif.iso_speed.or(exif.iso_speed_ratings.map(u32::from)));
+    // Some writers leave a 0 where they know none.
+    let iso = exif.and_then(|exif| exif.iso_speed.or(exif.iso_speed_ratings.map(u32::from))).filter(|iso| *iso > 0);
     let (RawImageData::Integer(all), Cfa(mosaic)) = (&raw.data, &raw.photometric) else {
         bail!("{shown}: expected integer counts of a Bayer mosaic")
     };
