@@ -15,13 +15,13 @@ import develop
 
 COLUMNS, ROWS, SCALE = 80, 64, 16.0
 K = np.array([[900.0, 0.0, 639.5], [0.0, 900.0, 511.5], [0.0, 0.0, 1.0]])
-D = np.array([-0.2, 0.05, 0.0, 0.0, 0.0])
+D = np.array([-0.02, 0.005, 0.0, 0.0, 0.0])
 MOUNT = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 CONFIDENCE_MIN, SAMPLES_MAX, INLIERS_MIN, PART_MIN = 0.05, 1200, 60, 0.25
 SEED_RAD, AGREE_RAD, SHARED_PX, GRAZING = 0.004, 0.015, 0.02, 0.1
 CUT, ROUNDS, GUESSES, JURY, MEDIAN_LENGTH, SPREAD_MIN = 4.685, 10, 64, 240, 1.177410022515, 5e-5
 INTERVAL, RANGE = 0.033333333, 5.0
-# OpenCV's own five rounds leave 0.06 px at the corners, which is 0.1 m/s of climb.
+# OpenCV's own five rounds leave 0.06 px at the corners of an ordinary lens, which is 0.1 m/s of climb.
 ROUNDS_OF_LENS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-6)
 
 
