@@ -8,6 +8,7 @@ use std::{
 
 use super::{
     flow_files::{self, Field},
+    photographs,
     picture::Picture,
     raws,
 };
@@ -164,7 +165,9 @@ fn part_of(name: &str) -> Option<(&str, usize)> {
     let (stem, role) = roles.into_iter().find_map(|(part, role)| Some((base.strip_suffix(part)?, role)))?;
     let fits = match role {
         2 => ["flo", "png"].contains(&ending),
-        _ => raws::is_raw(name) || ["png", "ppm", "pgm", "jpg", "jpeg"].contains(&ending.to_lowercase().as_str()),
+        _ => {
+            photographs::is_raw(name) || ["png", "ppm", "pgm", "jpg", "jpeg"].contains(&ending.to_lowercase().as_str())
+        }
     };
     (fits && !stem.is_empty()).then_some((stem, role))
 }
@@ -175,7 +178,7 @@ fn pairs(root: &Path, kind: Kind) -> (Vec<Item>, Vec<Skipped>) {
         if let Some((stem, role)) = part_of(&name) {
             let place = &mut parts.entry(stem.into()).or_default()[role];
             // Where a raw lies beside its developed picture, the picture is the published one.
-            if place.is_none() || !raws::is_raw(&name) {
+            if place.is_none() || !photographs::is_raw(&name) {
                 *place = Some(root.join(&name));
             }
         }
@@ -299,7 +302,7 @@ pub fn load(item: &Item) -> Result<Loaded, Skipped> {
         truths.push((condition.clone(), flow_files::read(path).map_err(|error| skip(said(&error)))?));
     }
     let size = truths.first().map_or((0, 0), |(_, truth)| (truth.width, truth.height));
-    let frames = if item.frames.iter().any(|path| raws::is_raw(&path.to_string_lossy())) {
+    let frames = if item.frames.iter().any(|path| photographs::is_raw(&path.to_string_lossy())) {
         raws::pair(item.frames.each_ref().map(PathBuf::as_path), size).map_err(|error| skip(said(&error)))?
     } else {
         let read = |path: &PathBuf| flow_files::read_frame(path).map(Picture::from).map_err(|error| skip(said(&error)));

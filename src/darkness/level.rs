@@ -18,6 +18,8 @@
 
 use nalgebra::DMatrix;
 
+use super::plane;
+
 /// Side of a patch, pixels.
 pub const PATCH: usize = 8;
 /// More patches than this are not looked at, so that a large image costs no more than a small one.
@@ -38,18 +40,9 @@ const PATCHES_A_VALUE: [usize; 2] = [10, 40];
 /// Why an image has no noise level.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
-    /// A plane does not have width × height values.
-    #[error("a plane of {width}×{height} needs {expected} values, found {found}")]
-    Length {
-        /// Columns.
-        width: usize,
-        /// Rows.
-        height: usize,
-        /// Columns × rows.
-        expected: usize,
-        /// Values that came.
-        found: usize,
-    },
+    /// No plane.
+    #[error(transparent)]
+    Plane(#[from] plane::Error),
     /// Too few patches for the covariance.
     #[error("{width}×{height} pixels hold {found} patches of 8×8, at least {needed} are needed")]
     Small {
@@ -61,16 +54,6 @@ pub enum Error {
         found: usize,
         /// Patches.
         needed: usize,
-    },
-    /// NaN or infinite.
-    #[error("pixel ({column}, {row}) is {value}, expected a finite value")]
-    Value {
-        /// Column.
-        column: usize,
-        /// Row.
-        row: usize,
-        /// As found.
-        value: f32,
     },
 }
 
@@ -92,8 +75,8 @@ pub fn noise_level_rgb(planes: [&[f32]; 3], width: usize, height: usize) -> Resu
 }
 
 fn level(planes: &[&[f32]], width: usize, height: usize) -> Result<f64, Error> {
-    for plane in planes {
-        check(plane, width, height)?;
+    for values in planes {
+        plane::check(values, width, height)?;
     }
     let room = |side: usize| (side + 1).saturating_sub(PATCH);
     let (found, needed) = (room(width) * room(height), PATCHES_A_VALUE[0] * PATCH * PATCH * planes.len());
@@ -156,17 +139,6 @@ fn smooth(planes: &[&[f32]], width: usize, corners: Vec<[usize; 2]>, waves: &DMa
         chosen.extend(group.iter().take(keep).map(|rate| rate.2));
     }
     chosen
-}
-
-fn check(plane: &[f32], width: usize, height: usize) -> Result<(), Error> {
-    let expected = width * height;
-    if plane.len() != expected {
-        return Err(Error::Length { width, height, expected, found: plane.len() });
-    }
-    match plane.iter().position(|value| !value.is_finite()) {
-        Some(at) => Err(Error::Value { column: at % width, row: at / width, value: plane[at] }),
-        None => Ok(()),
-    }
 }
 
 /// Columns and rows of the patches' corners: every `step`-th in reading order, as many as the limit allows. The step has

@@ -5,7 +5,11 @@
 
 use std::path::Path;
 
-use super::{ladder::SCALED, picture::Picture};
+use super::{
+    ladder::SCALED,
+    photographs::{self, RawPhotograph},
+    picture::Picture,
+};
 
 /// A raw photograph with whatever colour filter.
 #[derive(Debug, Clone, PartialEq)]
@@ -29,20 +33,9 @@ pub struct Mosaic {
 /// Why raws make no pair.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Built without the reader.
-    #[error(
-        "{0} is a camera raw file, and this build can't read those: rebuild with `cargo build --release --features raw` \
-         (rawler, which reads them, is LGPL-2.1)"
-    )]
-    Feature(String),
-    /// The reader refuses.
-    #[error("{path}: {reason}")]
-    Unreadable {
-        /// The file.
-        path: String,
-        /// Its words.
-        reason: String,
-    },
+    /// No photograph.
+    #[error(transparent)]
+    File(#[from] photographs::Error),
     /// A cell of the pattern lacks a colour, or there is no whole cell.
     #[error("expected a mosaic of whole Bayer or X-Trans cells, found {width}×{height} with a pattern of {period}")]
     Pattern {
@@ -64,12 +57,6 @@ pub enum Error {
         /// The truth's.
         to: (usize, usize),
     },
-}
-
-/// Whether a name ends as raw files do.
-pub fn is_raw(name: &str) -> bool {
-    let ending = name.rsplit('.').next().unwrap_or_default().to_lowercase();
-    ["cr2", "cr3", "arw", "raf", "dng", "nef"].contains(&ending.as_str())
 }
 
 /// Black levels that VBOF's authors took off, by the maker's name; the rest of the world has its file's own.
@@ -172,38 +159,17 @@ pub fn scaled(mosaics: [&Mosaic; 2], (width, height): (usize, usize)) -> Result<
 
 /// Reads two raw files and scales them as [`scaled`] does.
 pub fn pair(paths: [&Path; 2], size: (usize, usize)) -> Result<[Picture; 2], Error> {
-    let [first, second] = [read(paths[0])?, read(paths[1])?];
+    let [first, second] = [mosaic(paths[0])?, mosaic(paths[1])?];
     scaled([&first, &second], size)
 }
 
-#[cfg(not(feature = "raw"))]
-fn read(path: &Path) -> Result<Mosaic, Error> {
-    Err(Error::Feature(path.display().to_string()))
-}
-
-/// The active area of a raw file.
-#[cfg(feature = "raw")]
-fn read(path: &Path) -> Result<Mosaic, Error> {
-    use rawler::rawimage::{RawImageData, RawPhotometricInterpretation::Cfa};
-    let wrong = |reason: String| Error::Unreadable { path: path.display().to_string(), reason };
-    let raw = rawler::decode_file(path).map_err(|error| wrong(error.to_string()))?;
-    let (RawImageData::Integer(all), Cfa(mosaic)) = (&raw.data, &raw.photometric) else {
-        return Err(wrong("expected integer counts of a colour filter".into()));
-    };
-    let (left, top, width, height) = match raw.active_area {
-        Some(area) => (area.p.x, area.p.y, area.d.w, area.d.h),
-        None => (0, 0, raw.width, raw.height),
-    };
-    let period = if mosaic.cfa.width.is_multiple_of(3) { 6 } else { 2 };
-    let colour = |i: usize| mosaic.cfa.color_at(top + i / period, left + i % period) as u8;
-    let counts = (top..top + height).flat_map(|row| all[row * raw.width + left..][..width].iter().copied()).collect();
-    let maker = raw.clean_make.to_lowercase();
+/// A photograph with the black level that the authors took off.
+fn mosaic(path: &Path) -> Result<Mosaic, Error> {
+    let RawPhotograph { width, height, counts, black, white, period, colours, camera, .. } = photographs::read(path)?;
+    let maker = camera.to_lowercase();
     let authors = BLACKS.iter().find(|(name, _)| maker.starts_with(name)).map(|(_, black)| *black);
-    let levels = raw.blacklevel.as_vec();
-    let own = levels.iter().sum::<f32>() / levels.len().max(1) as f32;
-    let white = raw.whitelevel.as_vec().first().map_or(16383.0, |white| f64::from(*white));
     // The authors' level is that of 14-bit files; a file of another depth has its own.
-    let black = authors.filter(|_| white > 8192.0).unwrap_or(f64::from(own));
-    let colours = (0..period * period).map(colour).collect();
-    Ok(Mosaic { width, height, counts, black, white, period, colours })
+    let own = f64::from(black.iter().sum::<f32>() / 4.0);
+    let black = authors.filter(|_| white > 8192.0).unwrap_or(own);
+    Ok(Mosaic { width, height, counts, black, white: f64::from(white), period, colours })
 }

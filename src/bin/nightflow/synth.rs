@@ -13,6 +13,7 @@ use nightflow::{
     darkness::{
         flight::{self, Flight, Settings, Truth},
         pan::{self, Pan, Photograph},
+        photographs::{self, RawPhotograph},
         profiles,
     },
     recording::{Compression, Config, Writer},
@@ -234,40 +235,19 @@ fn sweep(args: &PanArgs) -> Result<()> {
     finish(out, &bar)
 }
 
-#[cfg(not(feature = "raw"))]
-fn read(path: &Path) -> Result<Photograph> {
-    bail!(
-        "{} is a camera raw file, and this build can't read those: rebuild with `cargo build --release --features raw` \
-         (rawler, which reads them, is LGPL-2.1)",
-        path.display()
-    )
-}
-
 /// The photograph's active area, from its first red pixel on.
-#[cfg(feature = "raw")]
 fn read(path: &Path) -> Result<Photograph> {
-    use rawler::rawimage::{RawImageData, RawPhotometricInterpretation::Cfa};
-    let raw = rawler::decode_file(path).with_context(|| path.display().to_string())?;
-    let (RawImageData::Integer(all), Cfa(mosaic)) = (&raw.data, &raw.photometric) else {
-        bail!("{}: expected integer counts of a Bayer mosaic", path.display())
-    };
-    let (left, top, wide, high) = match raw.active_area {
-        Some(area) => (area.p.x, area.p.y, area.d.w, area.d.h),
-        None => (0, 0, raw.width, raw.height),
-    };
-    let red = |dx: usize, dy: usize| {
-        let colour = |x, y| mosaic.cfa.color_at(y, x);
-        colour(left + dx, top + dy) == 0 && colour(left + dx + 1, top + dy + 1) == 2
-    };
-    let Some((dx, dy)) = [(0, 0), (1, 0), (0, 1), (1, 1)].into_iter().find(|(dx, dy)| red(*dx, *dy)) else {
+    let RawPhotograph { width: wide, height: high, counts: all, black, white, colours, camera, .. } =
+        photographs::read(path)?;
+    // Where the cell of the first pixel has its red; a larger pattern is no Bayer mosaic.
+    let Some(red) = (0..4).find(|red| colours.len() == 4 && colours[*red] == 0 && colours[3 - red] == 2) else {
         bail!("{}: expected a Bayer mosaic of red, green, green, blue", path.display())
     };
+    let (dx, dy) = (red % 2, red / 2);
     let (width, height) = ((wide - dx) / 2 * 2, (high - dy) / 2 * 2);
-    let rows = (top + dy..top + dy + height).map(|row| row * raw.width + left + dx);
-    let counts: Vec<u16> = rows.flat_map(|begin| all[begin..begin + width].iter().copied()).collect();
-    let black = raw.blacklevel.as_bayer_array().iter().map(|level| f64::from(*level)).sum::<f64>() / 4.0;
-    let white = f64::from(raw.whitelevel.as_bayer_array()[0]);
-    eprintln!("{} {}: {width}×{height}, black {black}, white {white}", raw.clean_make, raw.clean_model);
+    let counts: Vec<u16> = (dy..dy + height).flat_map(|row| all[row * wide + dx..][..width].iter().copied()).collect();
+    let (black, white) = (black.iter().map(|level| f64::from(*level)).sum::<f64>() / 4.0, f64::from(white));
+    eprintln!("{camera}: {width}×{height}, black {black}, white {white}");
     Ok(Photograph { width, height, counts, black: black.round(), white })
 }
 

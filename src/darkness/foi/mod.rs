@@ -21,6 +21,8 @@ mod fit;
 mod levels;
 mod wavelet;
 
+use super::plane::{self, check};
+
 pub use clip::Clip;
 pub use levels::Level;
 
@@ -68,18 +70,9 @@ impl Fit {
 /// Why a plane gives no (a, b).
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
-    /// A plane does not have width × height values.
-    #[error("a plane of {width}×{height} needs {expected} values, found {found}")]
-    Length {
-        /// Columns.
-        width: usize,
-        /// Rows.
-        height: usize,
-        /// Columns × rows.
-        expected: usize,
-        /// Values that came.
-        found: usize,
-    },
+    /// No plane.
+    #[error(transparent)]
+    Plane(#[from] plane::Error),
     /// Too few coefficients.
     #[error(
         "a plane of {width}×{height} has {found} wavelet coefficients away from its border, at least {needed} are needed"
@@ -93,16 +86,6 @@ pub enum Error {
         found: usize,
         /// Coefficients.
         needed: usize,
-    },
-    /// NaN or infinite.
-    #[error("pixel ({column}, {row}) is {value}, expected a finite value")]
-    Value {
-        /// Column.
-        column: usize,
-        /// Row.
-        row: usize,
-        /// As found.
-        value: f32,
     },
     /// The levels carry no line.
     #[error(
@@ -125,13 +108,7 @@ pub enum Error {
 
 /// (a, b) of one colour's plane (`height` × `width`), black off and white 1; values below black are negative.
 pub fn estimate(plane: &[f32], width: usize, height: usize, clip: Clip) -> Result<Fit, Error> {
-    let expected = width * height;
-    if plane.len() != expected {
-        return Err(Error::Length { width, height, expected, found: plane.len() });
-    }
-    if let Some(at) = plane.iter().position(|value| !value.is_finite()) {
-        return Err(Error::Value { column: at % width, row: at / width, value: plane[at] });
-    }
+    check(plane, width, height)?;
     let (found, needed) = (levels::cells(width, height), levels::CELLS_MIN);
     if found < needed {
         return Err(Error::Small { width, height, found, needed });
@@ -142,7 +119,7 @@ pub fn estimate(plane: &[f32], width: usize, height: usize, clip: Clip) -> Resul
         let Clip { low, high } = clip;
         return Err(Error::Flat { levels: levels.len(), darkest, brightest, low, high });
     };
-    let mean = plane.iter().map(|value| f64::from(*value)).sum::<f64>() / expected as f64;
+    let mean = plane.iter().map(|value| f64::from(*value)).sum::<f64>() / plane.len() as f64;
     Ok(Fit {
         a: line.a,
         b: line.b,

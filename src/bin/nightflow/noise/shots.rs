@@ -6,9 +6,8 @@ use anyhow::{Context, Result, bail};
 use nightflow::{
     camera::{Next, Sample, Source, mcap::Recording},
     clock::Stamp,
-    config::Config,
-    exposure::{self, Mosaic},
-    recording,
+    darkness::photographs::{self, RawPhotograph},
+    exposure::{self, Mosaic, Pattern},
 };
 
 use super::{Measure, Shot, ending};
@@ -94,12 +93,7 @@ impl Frames {
 }
 
 fn frames(path: &Path, args: &Measure) -> Result<Frames> {
-    let known = recording::metadata(path, "nightflow")?;
-    let mut config = match (&args.config, known.as_ref().and_then(|known| known.get("config"))) {
-        (Some(file), _) => launch::read(Some(file))?,
-        (None, Some(text)) => Config::parse(text, Path::new(&format!("in {}", path.display())))?,
-        (None, None) => Config::default(),
-    };
+    let mut config = launch::settings(args.config.as_deref(), path)?;
     config.exposure.black_level = args.black.or(config.exposure.black_level);
     config.exposure.white_level = args.white.or(config.exposure.white_level);
     if let Some(colours) = args.pattern {
@@ -137,61 +131,17 @@ fn dump(path: &Path, args: &Measure) -> Result<Shot> {
     Ok(Shot { name: name(path), camera: None, iso: None, mosaic })
 }
 
-#[cfg(not(feature = "raw"))]
-fn photograph(path: &Path) -> Result<Shot> {
-    bail!(
-        "{} is taken for a camera raw file, and this build can't read those: rebuild with \
-         `cargo build --release --features raw` (rawler, which reads them, is LGPL-2.1). \
-         Recordings end in .mcap, plain dumps of counts in .raw, .bin or .u16",
-        path.display()
-    )
-}
-
 /// The photograph's active area, with its camera and sensitivity.
-#[cfg(feature = "raw")]
 fn photograph(path: &Path) -> Result<Shot> {
-    use nightflow::exposure::Pattern;
-    use rawler::{
-        decoders::RawDecodeParams,
-        rawimage::{RawImageData, RawPhotometricInterpretation::Cfa},
-        rawsource::RawSource,
-    };
-    let shown = path.display().to_string();
-    let source = RawSource::new(path).with_context(|| shown.clone())?;
-    let (decoder, params) = (rawler::get_decoder(&source)?, RawDecodeParams::default());
-    let raw = decoder.raw_image(&source, &params, false).with_context(|| shown.clone())?;
-    let exif = decoder.raw_metadata(&source, &params).map(|known| known.exif).ok();
-    // Some writers leave a 0 where they know none.
-    let iso = exif.and_then(|exif| exif.iso_speed.or(exif.iso_speed_ratings.map(u32::from))).filter(|iso| *iso > 0);
-    let (RawImageData::Integer(all), Cfa(mosaic)) = (&raw.data, &raw.photometric) else {
-        bail!("{shown}: expected integer counts of a Bayer mosaic")
-    };
-    let (left, top, width, height) = match raw.active_area {
-        Some(area) => (area.p.x, area.p.y, area.d.w, area.d.h),
-        None => (0, 0, raw.width, raw.height),
-    };
-    let colours: Vec<usize> = (0..4).map(|place| mosaic.cfa.color_at(top + place / 2, left + place % 2)).collect();
+    let RawPhotograph { width, height, counts, black, white, colours, camera, iso, .. } = photographs::read(path)
+        .context("recordings end in .mcap, plain dumps of counts in .raw, .bin or .u16; all else is a camera's file")?;
     let pattern = match colours[..] {
         [0, 1, 1, 2] => Pattern::Rggb,
         [2, 1, 1, 0] => Pattern::Bggr,
         [1, 2, 0, 1] => Pattern::Gbrg,
         [1, 0, 2, 1] => Pattern::Grbg,
-        _ => bail!("{shown}: expected a Bayer mosaic, found {}", mosaic.cfa.name),
+        _ => bail!("{}: expected a Bayer mosaic, found a pattern of {} pixels", path.display(), colours.len()),
     };
-    if (mosaic.cfa.width, mosaic.cfa.height) != (2, 2) {
-        bail!("{shown}: expected a Bayer mosaic of 2×2, found one of {}×{}", mosaic.cfa.width, mosaic.cfa.height);
-    }
-    let rows = (top..top + height).map(|row| row * raw.width + left);
-    let counts = rows.flat_map(|begin| all[begin..begin + width].iter().copied()).collect();
-    // rawler gives levels from the sensor's own corner, which the active area need not share.
-    let levels = raw.blacklevel.as_bayer_array();
-    let black = std::array::from_fn(|place| levels[(top + place / 2) % 2 * 2 + (left + place % 2) % 2]);
-    let white = raw.whitelevel.as_bayer_array()[0];
-    let camera = Some(format!("{} {}", raw.clean_make, raw.clean_model));
-    Ok(Shot {
-        name: name(path),
-        camera,
-        iso,
-        mosaic: Mosaic { width, height, counts, pattern: Some(pattern), black, white },
-    })
+    let mosaic = Mosaic { width, height, counts, pattern: Some(pattern), black, white };
+    Ok(Shot { name: name(path), camera: Some(camera), iso, mosaic })
 }
