@@ -73,8 +73,7 @@ impl Recording {
     /// Opens a file, or a folder whose files are read one after the other.
     pub fn open(path: &Path, config: &Config) -> Result<Self, Error> {
         let lost = |reason: String| Error::Lost { source_name: path.display().to_string(), reason };
-        let files = if path.is_dir() { splits(path) } else { Ok(vec![path.to_owned()]) };
-        let files = files.map_err(|e| lost(e.to_string()))?;
+        let files = files(path).map_err(|e| lost(e.to_string()))?;
         if files.is_empty() {
             return Err(lost("expected a folder with .mcap files, found none in it".into()));
         }
@@ -220,10 +219,13 @@ fn decoded(kind: Kind, message: &Message<'_>, received: Stamp) -> Result<Sample,
     })
 }
 
-/// The `.mcap` files of a folder in the order of the number that rosbag2 puts at the end of their names.
-fn splits(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
+/// A recording's files: itself, or the `.mcap` files of a folder in the order of the number that rosbag2 puts at the end of their names.
+pub fn files(recording: &Path) -> std::io::Result<Vec<PathBuf>> {
+    if !recording.is_dir() {
+        return Ok(vec![recording.to_owned()]);
+    }
     let mut files = Vec::new();
-    for entry in std::fs::read_dir(folder)? {
+    for entry in std::fs::read_dir(recording)? {
         let path = entry?.path();
         if path.extension().is_some_and(|extension| extension == "mcap") {
             files.push(path);

@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, fs::File, path::Path, sync::Arc};
 
 use super::Error;
 use crate::{
-    camera::mcap::{Messages, Tear},
+    camera::mcap::{Messages, Tear, files},
     clock::Stamp,
 };
 
@@ -91,9 +91,11 @@ pub(super) fn stamp_of(cdr: &[u8]) -> Stamp {
 }
 
 /// The entries of the newest metadata record of this name, as in `nightflow` for the settings that a recording was
-/// made with.
+/// made with. Of a folder of rosbag2, what its first file says.
 pub fn metadata(path: &Path, name: &str) -> Result<Option<BTreeMap<String, String>>, Error> {
-    let mut messages = Messages::open(path).map_err(|source| Error::Io { path: path.into(), source })?;
+    let io = |source| Error::Io { path: path.into(), source };
+    let Some(file) = files(path).map_err(io)?.into_iter().next() else { return Ok(None) };
+    let mut messages = Messages::open(&file).map_err(io)?;
     // Ours stands before the first message; only a file that has none there is read on.
     let mut first = true;
     while messages.next().is_some() {

@@ -272,6 +272,7 @@ fn a_folder_of_rosbag2_is_read_file_by_file() {
     for (split, k) in [(9, 0), (10, 1)] {
         let path = folder.path().join(format!("bag_{split}.mcap"));
         let mut writer = Writer::create(&path, &Config::default()).unwrap();
+        writer.attach_metadata("nightflow", &settings()).unwrap();
         let frame = frame(k, 8, 4);
         writer.write("/camera/image_raw", frame.received, frame.stamp(), &frame.image).unwrap();
         writer.finish().unwrap();
@@ -279,6 +280,7 @@ fn a_folder_of_rosbag2_is_read_file_by_file() {
     fs::write(folder.path().join("metadata.yaml"), "rosbag2_bagfile_information:\n").unwrap();
     let samples = read(folder.path(), &camera::Config::default());
     assert_eq!(samples, [Sample::Frame(frame(0, 8, 4)), Sample::Frame(frame(1, 8, 4))]);
+    assert_eq!(recording::metadata(folder.path(), "nightflow").unwrap(), Some(settings()));
 }
 
 #[test]

@@ -4,22 +4,64 @@ use std::{
     collections::BTreeMap,
     path::Path,
     sync::{Arc, atomic::AtomicBool},
+    time::Duration,
 };
 
 use anyhow::{Context, Result};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use nightflow::{
+    camera,
     config::Config,
     flow::Matcher,
-    node::{Outputs, Report},
+    node::{self, Outputs, Report},
+    pipeline::Pipeline,
     publish::{self, iceoryx2::SharedSink},
-    recording::Recorder,
+    recording::{self, Recorder},
 };
 use signal_hook::consts::{SIGINT, SIGTERM};
 
 /// The configuration of a launch file, or the default where none is given.
 pub fn read(path: Option<&Path>) -> Result<Config> {
     Ok(path.map(Config::read).transpose()?.unwrap_or_default())
+}
+
+/// The launch file's settings; or else those that the recording was made with, but for its sinks.
+pub fn settings(launch_file: Option<&Path>, bag: &Path) -> Result<Config> {
+    if launch_file.is_some() {
+        return read(launch_file);
+    }
+    if !bag.exists() {
+        let missing = std::io::Error::new(std::io::ErrorKind::NotFound, "there is no such file or folder");
+        return Err(missing).with_context(|| bag.display().to_string());
+    }
+    let known = recording::metadata(bag, "nightflow")?;
+    let mut config = match known.as_ref().and_then(|known| known.get("config")) {
+        Some(text) => Config::parse(text, Path::new(&format!("in {}", bag.display())))?,
+        None => Config::default(),
+    };
+    (config.publish.iceoryx2, config.publish.ros2, config.publish.zenoh) = (None, None, None);
+    Ok(config)
+}
+
+/// Runs the node from its source to its outputs, with a bar for a finite source and a line for a live one.
+pub fn drive(
+    config: &Config,
+    pipeline: Option<&mut Pipeline>,
+    outputs: &mut Outputs<'_>,
+    stop: &AtomicBool,
+    finite: bool,
+) -> Result<Report> {
+    let bar = progress(finite)?;
+    let report = node::drive(
+        &mut || camera::open(&config.camera),
+        pipeline,
+        outputs,
+        stop,
+        Duration::from_secs_f64(config.camera.silence_s_max),
+        &mut |report, progress| advance(&bar, report, progress),
+    );
+    bar.finish_and_clear();
+    Ok(report?)
 }
 
 /// A flag that the first interrupt sets; the second ends the program at once.
@@ -95,7 +137,7 @@ pub fn progress(finite: bool) -> Result<ProgressBar> {
 }
 
 /// Brings the bar up to the report.
-pub fn advance(bar: &ProgressBar, report: &Report, progress: Option<f64>) {
+fn advance(bar: &ProgressBar, report: &Report, progress: Option<f64>) {
     bar.set_position((progress.unwrap_or(0.0) * 1000.0) as u64);
     bar.set_message(format!(
         "{} frames, {} steps, {} displaced, {} spoiled",

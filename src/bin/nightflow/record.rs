@@ -1,9 +1,9 @@
 //! `nightflow record`: a source's samples into an MCAP file, without the network.
 
-use std::{path::PathBuf, time::Duration};
+use std::path::PathBuf;
 
 use anyhow::{Result, bail};
-use nightflow::{camera, node};
+use nightflow::{camera, node::Outputs};
 
 use crate::{Exit, launch, summary::Summary};
 
@@ -30,20 +30,11 @@ pub fn run(args: Args) -> Result<Exit> {
         bail!(camera::Error::Settings("no file to write: give --out OUT.mcap or [recording] path".into()))
     };
     let stop = launch::stop()?;
-    let mut outputs = node::Outputs::default();
+    let mut outputs = Outputs::default();
     if let Some(recorder) = launch::recorder(&config, None)? {
         outputs.sinks.push(Box::new(recorder));
     }
-    let bar = launch::progress(false)?;
-    let report = node::drive(
-        &mut || camera::open(&config.camera),
-        None,
-        &mut outputs,
-        &stop,
-        Duration::from_secs_f64(config.camera.silence_s_max),
-        &mut |report, progress| launch::advance(&bar, report, progress),
-    )?;
-    bar.finish_and_clear();
+    let report = launch::drive(&config, None, &mut outputs, &stop, false)?;
     print!("{}", Summary { report: &report, outputs: vec![path.display().to_string()] });
     Ok(if report.lost_anything() { Exit::DataLost } else { Exit::Done })
 }

@@ -1,19 +1,9 @@
 //! `nightflow replay`: the main job on a file, and the check that a recording gives the same bytes again.
 
-use std::{
-    path::{Path, PathBuf},
-    time::Duration,
-};
+use std::path::PathBuf;
 
-use anyhow::{Context, Result};
-use nightflow::{
-    camera,
-    config::Config,
-    node::{self, Outputs},
-    pipeline::Pipeline,
-    publish::pictures::Pictures,
-    recording::{self, check::Check},
-};
+use anyhow::Result;
+use nightflow::{camera, pipeline::Pipeline, publish::pictures::Pictures, recording::check::Check};
 
 use crate::{Exit, launch, summary::Summary};
 
@@ -51,7 +41,7 @@ pub struct Args {
 
 /// Replays, prints the summary, and with --check the verdict.
 pub fn run(args: Args) -> Result<Exit> {
-    let mut config = effective(&args)?;
+    let mut config = launch::settings(args.config.as_deref(), &args.bag)?;
     config.camera.source = camera::SourceConfig::Mcap(camera::Mcap { path: args.bag.clone(), realtime: args.realtime });
     config.recording.path = args.out.clone();
     let stop = launch::stop()?;
@@ -68,7 +58,7 @@ pub fn run(args: Args) -> Result<Exit> {
     if let Some(check) = &mut check {
         outputs.sinks.push(Box::new(check));
     }
-    let report = drive(&config, &mut pipeline, &mut outputs, &stop)?;
+    let report = launch::drive(&config, Some(&mut pipeline), &mut outputs, &stop, true)?;
     drop(outputs);
     let mut written: Vec<String> = args.out.iter().map(|path| path.display().to_string()).collect();
     if let (Some(pictures), Some(dir)) = (&pictures, &args.pictures) {
@@ -86,43 +76,4 @@ pub fn run(args: Args) -> Result<Exit> {
         None => {}
     }
     Ok(if report.lost_anything() { Exit::DataLost } else { Exit::Done })
-}
-
-fn drive(
-    config: &Config,
-    pipeline: &mut Pipeline,
-    outputs: &mut Outputs<'_>,
-    stop: &std::sync::atomic::AtomicBool,
-) -> Result<node::Report> {
-    let bar = launch::progress(true)?;
-    let report = node::drive(
-        &mut || camera::open(&config.camera),
-        Some(pipeline),
-        outputs,
-        stop,
-        Duration::from_secs_f64(config.camera.silence_s_max),
-        &mut |report, progress| launch::advance(&bar, report, progress),
-    );
-    bar.finish_and_clear();
-    Ok(report?)
-}
-
-/// The launch file's settings; or else those that the recording was made with, but for its sinks.
-fn effective(args: &Args) -> Result<Config> {
-    if let Some(path) = &args.config {
-        return launch::read(Some(path));
-    }
-    if !args.bag.exists() {
-        let missing = std::io::Error::new(std::io::ErrorKind::NotFound, "there is no such file or folder");
-        return Err(missing).with_context(|| args.bag.display().to_string());
-    }
-    let known = recording::metadata(&args.bag, "nightflow")?;
-    let mut config = match known.as_ref().and_then(|known| known.get("config")) {
-        Some(text) => Config::parse(text, Path::new(&format!("in {}", args.bag.display())))?,
-        None => Config::default(),
-    };
-    config.publish.iceoryx2 = None;
-    config.publish.ros2 = None;
-    config.publish.zenoh = None;
-    Ok(config)
 }

@@ -1,9 +1,9 @@
 //! `nightflow run`: the live node, any source with any sinks.
 
-use std::{path::PathBuf, time::Duration};
+use std::path::PathBuf;
 
 use anyhow::Result;
-use nightflow::{camera, node, pipeline::Pipeline};
+use nightflow::pipeline::Pipeline;
 
 use crate::{Exit, launch, summary::Summary};
 
@@ -27,16 +27,7 @@ pub fn run(args: Args) -> Result<Exit> {
     let stop = launch::stop()?;
     let mut pipeline = Pipeline::open(&config)?;
     let mut outputs = launch::outputs(&config, Some(pipeline.network()))?;
-    let bar = launch::progress(false)?;
-    let report = node::drive(
-        &mut || camera::open(&config.camera),
-        Some(&mut pipeline),
-        &mut outputs,
-        &stop,
-        Duration::from_secs_f64(config.camera.silence_s_max),
-        &mut |report, progress| launch::advance(&bar, report, progress),
-    )?;
-    bar.finish_and_clear();
+    let report = launch::drive(&config, Some(&mut pipeline), &mut outputs, &stop, false)?;
     let kept = config.recording.path.map(|path| path.display().to_string());
     print!("{}", Summary { report: &report, outputs: kept.into_iter().collect() });
     Ok(if report.lost_anything() { Exit::DataLost } else { Exit::Done })

@@ -14,7 +14,7 @@ use nightflow::{
     clock::Stamp,
     config::Config,
     exposure::{Developer, Exposed},
-    node::{self, Outputs},
+    node::Outputs,
     pipeline::Pipeline,
     publish::{self, Offer, Sink, outgoing, paint},
     recording::{self, Output},
@@ -26,16 +26,11 @@ use crate::launch;
 
 /// Shows the recording's own results, or runs the network where it holds none.
 pub fn look(args: &Args, bag: &Path) -> Result<Story> {
-    let known = recording::metadata(&file_of(bag)?, "nightflow")?.unwrap_or_default();
-    let mut config = match (&args.config, known.get("config")) {
-        (Some(path), _) => launch::read(Some(path))?,
-        (None, Some(text)) => Config::parse(text, Path::new(&format!("in {}", bag.display())))?,
-        (None, None) => Config::default(),
-    };
+    let mut config = launch::settings(args.config.as_deref(), bag)?;
+    let known = recording::metadata(bag, "nightflow")?.unwrap_or_default();
     config.camera.source = camera::SourceConfig::Mcap(camera::Mcap { path: bag.into(), realtime: false });
     config.recording.path = None;
-    (config.publish.iceoryx2, config.publish.ros2, config.publish.zenoh) = (None, None, None);
-    let mut album = Album::new(args, Truths::open(&file_of(bag)?)?);
+    let mut album = Album::new(args, Truths::open(&first_file(bag)?)?);
     let recorded = recorded(bag, &config)?;
     let model = match recorded {
         Some(outputs) => {
@@ -63,15 +58,9 @@ pub fn look(args: &Args, bag: &Path) -> Result<Story> {
     Ok(story)
 }
 
-/// The one file of a folder, or the file itself.
-fn file_of(bag: &Path) -> Result<PathBuf> {
-    if !bag.is_dir() {
-        return Ok(bag.into());
-    }
-    let entries = std::fs::read_dir(bag).with_context(|| bag.display().to_string())?;
-    let mut files: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
-    files.retain(|path| path.extension().is_some_and(|ending| ending == "mcap"));
-    files.sort();
+/// The file itself, or the first of a folder.
+fn first_file(bag: &Path) -> Result<PathBuf> {
+    let files = camera::mcap::files(bag).with_context(|| bag.display().to_string())?;
     files.into_iter().next().with_context(|| format!("{}: expected an .mcap file in it, found none", bag.display()))
 }
 
@@ -161,19 +150,10 @@ fn run(config: &Config, album: &mut Album) -> Result<String> {
     let model = pipeline.network().model();
     let model = format!("{} {}, run now (the recording holds no flow)", model.name, model.version);
     let stop = launch::stop()?;
-    let bar = launch::progress(true)?;
     let mut outputs = Outputs::default();
     outputs.sinks.push(Box::new(&mut *album));
-    node::drive(
-        &mut || camera::open(&config.camera),
-        Some(&mut pipeline),
-        &mut outputs,
-        &stop,
-        Duration::from_secs_f64(config.camera.silence_s_max),
-        &mut |report, progress| launch::advance(&bar, report, progress),
-    )?;
+    launch::drive(config, Some(&mut pipeline), &mut outputs, &stop, true)?;
     drop(outputs);
-    bar.finish_and_clear();
     match album.failed.take() {
         Some(error) => Err(error),
         None if stop.load(Ordering::Relaxed) => bail!("interrupted"),
