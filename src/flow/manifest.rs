@@ -32,7 +32,8 @@ pub struct Entry {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
-    /// `image` → `level2` … `level6`; two frames' levels and `scale` → `flow` and `uncertainty`.
+    /// `image` → features of one frame, named `…level2` where they have a quarter of its rows and columns, and so on; any
+    /// of them as `older_…` and `newer_…`, and `scale` → `flow` and `uncertainty`.
     PyramidDecoder,
 }
 

@@ -22,8 +22,16 @@ use crate::flow::{
     runtime::{self, Tried},
 };
 
-/// The pyramid's levels: level l has 1/2^l of the image's rows and columns.
-const LEVELS: [usize; 5] = [2, 3, 4, 5, 6];
+/// One kind of features that the pyramid gives for a frame.
+struct Feature {
+    /// The pyramid's output. The decoder takes it as `older_…`, as `newer_…`, or both.
+    name: String,
+    /// It has 1/2^level of the image's rows and columns.
+    level: usize,
+    channels: usize,
+    /// The names under which the decoder reads the older and the newer frame's, where it does.
+    read_as: [Option<String>; 2],
+}
 
 /// A pyramid and a decoder with their memory.
 ///
@@ -32,7 +40,7 @@ const LEVELS: [usize; 5] = [2, 3, 4, 5, 6];
 pub struct Onnx {
     pyramid: Graph,
     decoder: Graph,
-    channels: [usize; 5],
+    features: Vec<Feature>,
     memory: Option<Memory>,
     scale: Tensor<f32>,
     golden: Option<Golden>,
@@ -114,39 +122,58 @@ impl Graph {
         Ok(Self { binding, session })
     }
 
-    /// Refuses a graph that lacks a name that it will be called by.
-    fn check(&self, file: &str, inputs: &[String], outputs: &[String]) -> Result<(), Error> {
-        for (found, wanted) in [(self.session.inputs(), inputs), (self.session.outputs(), outputs)] {
-            let found: Vec<&str> = found.iter().map(Outlet::name).collect();
-            if wanted.len() != found.len() || wanted.iter().any(|name| !found.contains(&name.as_str())) {
-                return Err(Error::Interface { file: file.into(), wanted: wanted.join(", "), found: found.join(", ") });
-            }
-        }
-        Ok(())
+    fn inputs(&self) -> Vec<&str> {
+        self.session.inputs().iter().map(Outlet::name).collect()
+    }
+
+    fn outputs(&self) -> Vec<&str> {
+        self.session.outputs().iter().map(Outlet::name).collect()
     }
 }
 
-/// `level2` … `level6`, each with a prefix.
-fn levels(prefix: &str) -> Vec<String> {
-    LEVELS.iter().map(|level| format!("{prefix}level{level}")).collect()
+/// Refuses names that are not exactly those that are wanted, in any order.
+fn same(file: &str, found: &[&str], wanted: &[&str]) -> Result<(), Error> {
+    if wanted.len() != found.len() || wanted.iter().any(|name| !found.contains(name)) {
+        return Err(Error::Interface { file: file.into(), wanted: wanted.join(", "), found: found.join(", ") });
+    }
+    Ok(())
 }
 
-/// How many channels each level has, as the pyramid declares.
-fn channels(file: &str, pyramid: &Session) -> Result<[usize; 5], Error> {
-    let mut channels = [0; 5];
-    for (count, name) in channels.iter_mut().zip(levels("")) {
-        let declared =
-            pyramid.outputs().iter().find(|outlet| outlet.name() == name).and_then(|outlet| match outlet.dtype() {
-                ValueType::Tensor { shape, .. } if shape.len() == 4 => usize::try_from(shape[1]).ok(),
-                _ => None,
-            });
-        *count = declared.filter(|&count| count > 0).ok_or_else(|| Error::Interface {
-            file: file.into(),
-            wanted: format!("{name} as [1, a fixed number of channels, rows, columns]"),
-            found: format!("{:?}", pyramid.outputs()),
-        })?;
+/// What the pyramid gives and the decoder reads: outputs `…level3` of [1, channels, rows / 8, columns / 8], and so on.
+fn features(entry: &manifest::Entry, pyramid: &Graph, decoder: &Graph) -> Result<Vec<Feature>, Error> {
+    let unfit = |file: &manifest::File, wanted: &str, found: String| Error::Interface {
+        file: file.file.clone(),
+        wanted: wanted.into(),
+        found,
+    };
+    same(&entry.pyramid.file, &pyramid.inputs(), &["image"])?;
+    same(&entry.decoder.file, &decoder.outputs(), &["flow", "uncertainty"])?;
+    let mut unread = decoder.inputs();
+    let mut read = |name: String| {
+        let place = unread.iter().position(|input| *input == name)?;
+        unread.remove(place);
+        Some(name)
+    };
+    let scaled = read("scale".into());
+    let feature = |outlet: &Outlet| {
+        let name = outlet.name();
+        let level = name.rsplit_once("level").and_then(|(_, level)| level.parse().ok()).filter(|level| *level <= 6)?;
+        let ValueType::Tensor { shape, .. } = outlet.dtype() else { return None };
+        let channels = usize::try_from(*shape.get(1)?).ok().filter(|&count| count > 0 && shape.len() == 4)?;
+        let read_as = ["older", "newer"].map(|frame| read(format!("{frame}_{name}")));
+        Some(Feature { name: name.into(), level, channels, read_as })
+    };
+    let given: Option<Vec<Feature>> = pyramid.session.outputs().iter().map(feature).collect();
+    let given = given.filter(|given| !given.is_empty()).ok_or_else(|| {
+        let wanted = "outputs named …level0 to …level6, each [1, a fixed number of channels, rows, columns]";
+        unfit(&entry.pyramid, wanted, format!("{:?}", pyramid.session.outputs()))
+    })?;
+    if scaled.is_none() || !unread.is_empty() {
+        let names = |given: &[Feature]| given.iter().map(|feature| feature.name.clone()).collect::<Vec<_>>().join(", ");
+        let wanted = format!("scale, and older_ and newer_ before any of {}", names(&given));
+        return Err(unfit(&entry.decoder, &wanted, decoder.inputs().join(", ")));
     }
-    Ok(channels)
+    Ok(given)
 }
 
 impl Onnx {
@@ -159,10 +186,7 @@ impl Onnx {
         let Kind::PyramidDecoder = entry.kind;
         let open = |file| Graph::open(&environment, &manifest::read(&folder, file)?, config.threads);
         let (pyramid, decoder) = (open(&entry.pyramid)?, open(&entry.decoder)?);
-        pyramid.check(&entry.pyramid.file, &["image".into()], &levels(""))?;
-        let inputs = [levels("older_"), levels("newer_"), vec!["scale".into()]].concat();
-        decoder.check(&entry.decoder.file, &inputs, &["flow".into(), "uncertainty".into()])?;
-        let channels = channels(&entry.pyramid.file, &pyramid.session)?;
+        let features = features(&entry, &pyramid, &decoder)?;
         let mut assigned = provider::assigned(&pyramid.session).map_err(failed("name its providers"))?;
         for (name, count) in provider::assigned(&decoder.session).map_err(failed("name its providers"))? {
             *assigned.entry(name).or_insert(0) += count;
@@ -172,7 +196,7 @@ impl Onnx {
         Ok(Self {
             pyramid,
             decoder,
-            channels,
+            features,
             memory: None,
             scale: Tensor::from_array(([2usize], vec![1.0f32, 1.0])).map_err(failed("reserve memory"))?,
             golden: entry.golden,
@@ -188,7 +212,7 @@ impl Onnx {
             self.pyramid.binding.clear();
             self.decoder.binding.clear();
             self.memory = None;
-            self.memory = Some(Memory::new(width, height, &self.channels).map_err(failed("reserve memory"))?);
+            self.memory = Some(Memory::new(width, height, &self.features).map_err(failed("reserve memory"))?);
         }
         // The branch above has just filled it.
         self.memory.as_mut().ok_or(Error::Session { doing: "reserve memory", reason: "there is none".into() })
@@ -196,12 +220,12 @@ impl Onnx {
 }
 
 impl Memory {
-    fn new(width: usize, height: usize, channels: &[usize; 5]) -> ort::Result<Self> {
+    fn new(width: usize, height: usize, features: &[Feature]) -> ort::Result<Self> {
         let allocator = Allocator::default();
-        let level = |(&level, &count): (&usize, &usize)| {
-            Tensor::<f32>::new(&allocator, [1, count, height >> level, width >> level])
+        let tensor = |Feature { level, channels, .. }: &Feature| {
+            Tensor::<f32>::new(&allocator, [1, *channels, height >> level, width >> level])
         };
-        let slot = || LEVELS.iter().zip(channels).map(level).collect::<ort::Result<Vec<_>>>();
+        let slot = || features.iter().map(tensor).collect::<ort::Result<Vec<_>>>();
         let image = Tensor::<f32>::new(&allocator, [1, 3, height, width])?;
         Ok(Self { width, height, image, features: [slot()?, slot()?] })
     }
@@ -215,8 +239,8 @@ impl Network for Onnx {
         let Graph { binding, session } = &mut self.pyramid;
         let mut run = || -> ort::Result<()> {
             binding.bind_input("image", &memory.image)?;
-            for (name, tensor) in levels("").into_iter().zip(&mut memory.features[slot.index()]) {
-                binding.bind_output(name, tensor)?;
+            for (feature, tensor) in self.features.iter().zip(&mut memory.features[slot.index()]) {
+                binding.bind_output(&feature.name, tensor)?;
             }
             session.run_binding(binding).map(drop)
         };
@@ -234,9 +258,11 @@ impl Network for Onnx {
         self.scale.extract_tensor_mut().1.copy_from_slice(&scale);
         let Graph { binding, session } = &mut self.decoder;
         let mut run = || -> ort::Result<u64> {
-            for (prefix, slot) in [("older_", older), ("newer_", older.other())] {
-                for (name, tensor) in levels(prefix).into_iter().zip(&memory.features[slot.index()]) {
-                    binding.bind_input(name, tensor)?;
+            for (frame, slot) in [older, older.other()].into_iter().enumerate() {
+                for (feature, tensor) in self.features.iter().zip(&memory.features[slot.index()]) {
+                    if let Some(name) = &feature.read_as[frame] {
+                        binding.bind_input(name, tensor)?;
+                    }
                 }
             }
             binding.bind_input("scale", &self.scale)?;
