@@ -14,9 +14,11 @@ from torch import nn
 
 import checkpoints
 from networks import PwcNet
+from raft import RaftSmall
 
 OPSET = 17
 LEVEL_NAMES = [f"level{level}" for level in range(2, 7)]
+FRAMES = ("older", "newer")
 LARGEST_FILE = 20_000_000
 PARITY_PX = 1e-3
 GOLDEN_HEIGHT, GOLDEN_WIDTH = 128, 192
@@ -25,10 +27,12 @@ GOLDEN_TOLERANCE = 0.02
 
 
 class FrameGraph(nn.Module):
-    """The pyramid behind the interface that the node uses: five levels, whatever the network's coarsest is.
+    """PWC-Net's pyramid behind the interface that the node uses: five levels, whatever the network's coarsest is.
 
     Levels that the network has not are given as averages of the coarsest, and nobody reads them.
     """
+
+    names = LEVEL_NAMES
 
     def __init__(self, network: PwcNet):
         super().__init__()
@@ -42,11 +46,13 @@ class FrameGraph(nn.Module):
 
 
 class PairGraph(nn.Module):
-    """The decoder behind the interface that the node uses.
+    """PWC-Net's decoder behind the interface that the node uses.
 
     Ten feature maps and `scale` [2] (camera pixels per network pixel) to flow [1, H/4, W/4, 2] in camera pixels and
     the expected end-point error [1, H/4, W/4] in network pixels.
     """
+
+    names = [f"{frame}_{name}" for frame in FRAMES for name in LEVEL_NAMES]
 
     def __init__(self, network: PwcNet):
         super().__init__()
@@ -55,6 +61,33 @@ class PairGraph(nn.Module):
     def forward(self, *inputs):
         flows, expected = self.decoder(inputs[:5], inputs[5:10])
         return (4.0 * flows[-1]).permute(0, 2, 3, 1) * inputs[10], expected[:, 0]
+
+
+class RaftFrameGraph(nn.Module):
+    """RAFT-small's encoders: what is matched, and state and context."""
+
+    names = ["match_level3", "context_level3"]
+
+    def __init__(self, network: RaftSmall):
+        super().__init__()
+        self.network = network
+
+    def forward(self, image):
+        return self.network.frame(image)
+
+
+class RaftPairGraph(nn.Module):
+    """RAFT-small's correlations and updates; of the newer frame only what is matched is read."""
+
+    names = ["older_match_level3", "newer_match_level3", "older_context_level3"]
+
+    def __init__(self, network: RaftSmall):
+        super().__init__()
+        self.network = network
+
+    def forward(self, older, newer, context, scale):
+        flows, expected = self.network.pair(older, newer, context)
+        return flows[-1].permute(0, 2, 3, 1) * scale, expected[:, 0]
 
 
 def golden_frames() -> tuple[np.ndarray, np.ndarray]:
@@ -97,33 +130,39 @@ def traced(module: nn.Module, inputs: tuple, names: list[str], outputs: list[str
     return onnx.load_from_string(memory.getvalue())
 
 
-def declare(decoder: onnx.ModelProto, inputs: list[str], features: list[torch.Tensor]) -> None:
+def declare(decoder: onnx.ModelProto, inputs: dict[str, torch.Tensor]) -> None:
     """Puts the inputs that a shallow network does not read back into the decoder's interface, in order."""
     present = {i.name: i for i in decoder.graph.input}
-    for name, feature in zip(inputs, [*features, *features]):
-        level = name.split("_")[1]
+    for name, feature in inputs.items():
+        level = name[name.index("level") :]
         shape = [1, feature.shape[1], f"rows_{level}", f"columns_{level}"]
         present.setdefault(name, onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape))
     del decoder.graph.input[:]
     decoder.graph.input.extend(present[name] for name in [*inputs, "scale"])
 
 
-def graphs_of(network: PwcNet) -> dict[str, onnx.ModelProto]:
+def graphs_of(network: nn.Module) -> dict[str, onnx.ModelProto]:
     """`pyramid` and `decoder` graphs of a network in evaluation mode."""
+    graphs = (RaftFrameGraph, RaftPairGraph) if isinstance(network, RaftSmall) else (FrameGraph, PairGraph)
+    frame, pair = (graph(network).eval() for graph in graphs)
     image = torch.rand(1, 3, GOLDEN_HEIGHT, GOLDEN_WIDTH)
-    frame = FrameGraph(network).eval()
-    features = frame(image)
-    rows = {name: {2: f"rows_{name}", 3: f"columns_{name}"} for name in LEVEL_NAMES}
+    features = dict(zip(frame.names, frame(image)))
+    inputs = {name: features[name.split("_", 1)[1]] for name in pair.names}
+
+    def axes(name: str) -> dict:
+        level = name[name.index("level") :]
+        return {2: f"rows_{level}", 3: f"columns_{level}"}
+
     pyramid = traced(
-        frame, (image,), ["image"], LEVEL_NAMES, {"image": {2: "height", 3: "width"}, **rows}
+        frame, (image,), ["image"], frame.names,
+        {"image": {2: "height", 3: "width"}, **{name: axes(name) for name in frame.names}},
     )
-    inputs = [f"{frame}_{name}" for frame in ("older", "newer") for name in LEVEL_NAMES]
-    axes = {f"{frame}_{name}": rows[name] for frame in ("older", "newer") for name in LEVEL_NAMES}
-    axes |= {out: {1: "rows_level2", 2: "columns_level2"} for out in ("flow", "uncertainty")}
+    raster = {1: "rows_level2", 2: "columns_level2"}
     decoder = traced(
-        PairGraph(network), (*features, *features, torch.ones(2)), [*inputs, "scale"], ["flow", "uncertainty"], axes
+        pair, (*inputs.values(), torch.ones(2)), [*inputs, "scale"], ["flow", "uncertainty"],
+        {"flow": raster, "uncertainty": raster, **{name: axes(name) for name in inputs}},
     )
-    declare(decoder, inputs, features)
+    declare(decoder, inputs)
     return {"pyramid": with_half_weights(pyramid), "decoder": with_half_weights(decoder)}
 
 
@@ -136,22 +175,23 @@ class Exported:
         self.pyramid, self.decoder = (
             onnxruntime.InferenceSession(g, options, providers=["CPUExecutionProvider"]) for g in (pyramid, decoder)
         )
+        self.names = [output.name for output in self.pyramid.get_outputs()]
 
-    def features(self, image: np.ndarray) -> list[np.ndarray]:
-        """Levels 2...6 of one frame."""
-        return self.pyramid.run(LEVEL_NAMES, {"image": image})
+    def features(self, image: np.ndarray) -> dict[str, np.ndarray]:
+        """Everything about one frame, by name."""
+        return dict(zip(self.names, self.pyramid.run(self.names, {"image": image})))
 
-    def flow(self, older: list, newer: list, scale=(1.0, 1.0)) -> list[np.ndarray]:
+    def flow(self, older: dict, newer: dict, scale=(1.0, 1.0)) -> list[np.ndarray]:
         """Flow [1, H/4, W/4, 2] and expected error [1, H/4, W/4]."""
-        feed = {f"older_{n}": f for n, f in zip(LEVEL_NAMES, older)}
-        feed |= {f"newer_{n}": f for n, f in zip(LEVEL_NAMES, newer)}
+        features = {f"{frame}_{n}": f for frame, given in zip(FRAMES, (older, newer)) for n, f in given.items()}
+        feed = {i.name: features[i.name] for i in self.decoder.get_inputs() if i.name != "scale"}
         return self.decoder.run(["flow", "uncertainty"], feed | {"scale": np.array(scale, np.float32)})
 
     def __call__(self, older: np.ndarray, newer: np.ndarray, scale=(1.0, 1.0)) -> list[np.ndarray]:
         return self.flow(self.features(older), self.features(newer), scale)
 
 
-def rounded(network: PwcNet) -> PwcNet:
+def rounded(network: nn.Module) -> nn.Module:
     """The network as the files hold it: large weights through fp16 and back."""
     with torch.no_grad():
         for parameter in network.parameters():
@@ -161,11 +201,11 @@ def rounded(network: PwcNet) -> PwcNet:
 
 
 @torch.no_grad()
-def parity(network: PwcNet, exported: Exported, older: np.ndarray, newer: np.ndarray) -> float:
+def parity(network: nn.Module, exported: Exported, older: np.ndarray, newer: np.ndarray) -> float:
     """Greatest difference in pixels between the graphs and PyTorch on one pair."""
     flows, expected = network(torch.from_numpy(older), torch.from_numpy(newer))
     flow, uncertainty = exported(older, newer)
-    by_torch = (4 * flows[-1]).permute(0, 2, 3, 1).numpy()
+    by_torch = network.weighed(flows)[-1][0].permute(0, 2, 3, 1).numpy()
     return max(np.abs(flow - by_torch).max(), np.abs(uncertainty - expected[:, 0].numpy()).max())
 
 
@@ -210,14 +250,25 @@ def main() -> None:
     parser.add_argument("--name", default="pwcnet_fcdn")
     parser.add_argument("--version", required=True, help="such as 2026-11-22.1")
     parser.add_argument("--models", type=Path, default=Path("../models"))
+    parser.add_argument("--iterations", type=int, nargs="+", help="for RAFT-small: a network for each, as 8 4 12")
     arguments = parser.parse_args()
     state = checkpoints.load(arguments.checkpoint)
-    network = PwcNet(state["coarsest"]).eval()
-    network.load_state_dict(state["mean"])
+    if (state["kind"] == "raftsmall") != bool(arguments.iterations):
+        raise SystemExit(f"{arguments.checkpoint}: holds a {state['kind']}; --iterations is for raftsmall, and needed there")
     arguments.models.mkdir(parents=True, exist_ok=True)
+    if state["kind"] == "pwcnet":
+        export(arguments, PwcNet(state["coarsest"]), state, arguments.name)
+    for iterations in arguments.iterations or []:
+        first = iterations == arguments.iterations[0]
+        export(arguments, RaftSmall(iterations), state, arguments.name if first else f"{arguments.name}_{iterations}")
+
+
+def export(arguments: argparse.Namespace, network: nn.Module, state: dict, name: str) -> None:
+    """Writes, checks and enters one network. RAFT-small's numbers of iterations share the pyramid's file."""
+    network.eval().load_state_dict(state["mean"])
     files = {}
     for part, graph in graphs_of(network).items():
-        files[part] = arguments.models / f"{arguments.name}_{part}.onnx"
+        files[part] = arguments.models / f"{arguments.name if part == 'pyramid' else name}_{part}.onnx"
         onnx.checker.check_model(graph)
         written = graph.SerializeToString()
         if len(written) > LARGEST_FILE:
@@ -229,8 +280,8 @@ def main() -> None:
         print(f"{height}x{width}: graphs and PyTorch differ by at most {worst:.1e} px")
         if worst > PARITY_PX:
             raise SystemExit(f"{height}x{width}: expected graphs within {PARITY_PX} px of PyTorch, got {worst}")
-    entry = manifest_entry(arguments.name, arguments.version, files, exported)
-    write_manifest(arguments.models / "manifest.toml", arguments.name, entry)
+    entry = manifest_entry(name, arguments.version, files, exported)
+    write_manifest(arguments.models / "manifest.toml", name, entry)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ SIDE = 2 * REACH + 1
 # Columns a tile of the cost volume has; inputs are multiples of 64 wide, so these divide the levels' widths.
 TILES = {2: 16, 3: 8}
 IMAGE_MEAN = 0.4
+LEVEL_WEIGHTS = {6: 0.25, 5: 0.25, 4: 0.4, 3: 0.5, 2: 1.0}
 
 
 def conv(inputs: int, outputs: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
@@ -180,6 +181,9 @@ class Decoder(nn.Module):
 class PwcNet(nn.Module):
     """Pyramid and decoder together, as they are trained."""
 
+    # Scalars that have a long way to go.
+    FAST = ("sharpness",)
+
     def __init__(self, coarsest: int = 6):
         super().__init__()
         self.pyramid, self.decoder = Pyramid(coarsest), Decoder(coarsest)
@@ -192,6 +196,12 @@ class PwcNet(nn.Module):
                 last.weight.mul_(0.1)
             for decoder in self.decoder.levels:
                 decoder.predict.bias[2] = -1.5
+
+    @staticmethod
+    def weighed(flows: list[torch.Tensor]) -> list[tuple[torch.Tensor, float]]:
+        """Flows in pixels of the image, from the coarsest level to level 2, with their weights in the loss."""
+        levels = levels_from(len(flows) + 1)
+        return [(flow * 2**level, LEVEL_WEIGHTS[level]) for level, flow in zip(levels, flows)]
 
     def forward(self, older: torch.Tensor, newer: torch.Tensor):
         """One shared pyramid call for both frames, then the decoder."""

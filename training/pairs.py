@@ -8,10 +8,15 @@ import numpy as np
 import torch
 from PIL import Image
 
-from scenes import Textures, scene, uniform
+from scenes import MIXTURE, Textures, scene, uniform
 
 MEAN_LEVEL = 0.4
 DARKEST = 30.0
+
+
+def levels(batch: int, darkest: float = DARKEST, towards_bright: float = 1.0) -> torch.Tensor:
+    """[B] noise levels 0...darkest: evenly, or with a power above 1 more of the bright ones."""
+    return darkest * torch.rand(batch) ** towards_bright
 
 
 def linear(first: torch.Tensor, second: torch.Tensor, jitter: bool = True):
@@ -28,25 +33,27 @@ def linear(first: torch.Tensor, second: torch.Tensor, jitter: bool = True):
     return tuple((frame * g.view(-1, 1, 1, 1)).clamp(0, 1) for frame, g in zip(frames, gains))
 
 
-def noisy(first: torch.Tensor, second: torch.Tensor, level: float | None = None):
-    """z ~ N(y, a y + b), clipped; `level` is the deviation at a grey of 0.4 in 1/255, drawn evenly over 0...30 if None.
+def noisy(first: torch.Tensor, second: torch.Tensor, level: float | torch.Tensor):
+    """z ~ N(y, a y + b), clipped; `level` (one for all, or [B]) is the deviation at a grey of 0.4 in 1/255.
 
     The shot part grows against the read part as in the paper; the deviation differs a little from channel to channel,
     since binning averages two greens and white balance multiplies red and blue.
     """
     batch = len(first)
-    levels = uniform(batch, 0, DARKEST) if level is None else torch.full((batch,), float(level))
-    deviation = (levels / 255).view(-1, 1, 1, 1) * uniform(batch * 3, 0.7, 1.3).view(batch, 3, 1, 1)
+    level = torch.as_tensor(level, dtype=torch.float32).expand(batch)
+    deviation = (level / 255).view(-1, 1, 1, 1) * uniform(batch * 3, 0.7, 1.3).view(batch, 3, 1, 1)
     shot = uniform(batch, 0.3, 1.0).view(-1, 1, 1, 1)
     a, b = deviation**2 * shot / MEAN_LEVEL, deviation**2 * (1 - shot)
     return tuple((y + torch.randn_like(y) * torch.sqrt(a * y + b)).clamp(0, 1) for y in (first, second))
 
 
-def batch_of(textures: Textures, batch: int, height: int, width: int, level: float | None = None, clean: bool = False):
-    """A training batch: older, newer [B, 3, H, W] and the flow [B, 2, H, W]."""
-    first, second, flow = scene(textures, batch, height, width)
+def batch_of(textures: Textures, height: int, width: int, level: torch.Tensor | None, mixture=MIXTURE, batch: int = 4):
+    """A training batch: older, newer [B, 3, H, W] and the flow [B, 2, H, W]; one pair for each noise level, or `batch`
+    clean ones."""
+    batch = batch if level is None else len(level)
+    first, second, flow = scene(textures, batch, height, width, mixture)
     first, second = linear(first, second)
-    if not clean:
+    if level is not None:
         first, second = noisy(first, second, level)
     return first, second, flow
 
@@ -58,7 +65,7 @@ class HeldOut:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             textures = Textures(packed, held_out=True)
-            parts = [batch_of(textures, 4, height, width, clean=True) for _ in range(-(-count // 4))]
+            parts = [batch_of(textures, height, width, None) for _ in range(-(-count // 4))]
         self.first, self.second, self.flow = (torch.cat(p)[:count] for p in zip(*parts))
 
     def at(self, level: float, seed: int = 11):

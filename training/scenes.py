@@ -89,10 +89,10 @@ def uniform(batch: int, low: float, high: float) -> torch.Tensor:
     return low + (high - low) * torch.rand(batch)
 
 
-def magnitudes(batch: int) -> torch.Tensor:
+def magnitudes(batch: int, mixture) -> torch.Tensor:
     """[B] typical displacement of a scene in pixels, from the mixture."""
-    shares = torch.tensor([share for share, _, _ in MIXTURE])
-    bounds = torch.tensor([bounds for _, *bounds in MIXTURE])[torch.multinomial(shares, batch, replacement=True)]
+    shares = torch.tensor([share for share, _, _ in mixture])
+    bounds = torch.tensor([bounds for _, *bounds in mixture])[torch.multinomial(shares, batch, replacement=True)]
     return bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) * torch.rand(batch)
 
 
@@ -198,14 +198,14 @@ class Outline:
         return (torch.where(b(self.barred), cover * bars, cover) * b(self.present))[:, None]
 
 
-def scene(textures: Textures, batch: int, height: int, width: int, shapes: int = 5):
+def scene(textures: Textures, batch: int, height: int, width: int, mixture=MIXTURE, shapes: int = 5):
     """Two frames [B, 3, H, W] in 0...1 and the flow [B, 2, H, W] from the first to the second, in pixels."""
     side = min(SIDE, 64 * math.ceil(1.6 * max(height, width) / 64))
     size = 0.5 * math.hypot(height, width)
     x, y = torch.arange(width).float(), torch.arange(height).float()
     points = torch.stack(torch.meshgrid(x, y, indexing="xy"))[None]
     middle = torch.full((batch,), width / 2.0), torch.full((batch,), height / 2.0)
-    magnitude = magnitudes(batch)
+    magnitude = magnitudes(batch, mixture)
     # Some scenes have a still camera and moving things, some a moving camera over still things.
     camera = homographies(magnitude * (torch.rand(batch) > 0.1), *middle, size)
     ground = Surface(textures.draw(batch, side), height, width)

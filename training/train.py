@@ -16,21 +16,32 @@ import torch.nn.functional as F
 from torch import nn
 
 import checkpoints
-from networks import PwcNet, levels_from
-from pairs import HeldOut, batch_of
-from scenes import Textures
+from networks import PwcNet
+from pairs import DARKEST, HeldOut, batch_of, levels
+from raft import RaftSmall
+from scenes import MIXTURE, Textures
 
-LEVEL_WEIGHTS = {6: 0.25, 5: 0.25, 4: 0.4, 3: 0.5, 2: 1.0}
-JUDGED_LEVELS = (0, 10, 20, 30)
+JUDGED_LEVELS = (0, 10, 20, 30, 60)
 
 
-def loss_of(flows, expected, truth):
-    """Multi-scale end-point error in pixels of the input, plus the likelihood of the error head (exponential law)."""
+def network_of(description: dict) -> nn.Module:
+    """The network that a run's TOML describes, untrained but for published weights that it starts from."""
+    kind = description.get("network", "pwcnet")
+    if kind == "pwcnet":
+        return PwcNet(description["coarsest"])
+    if kind == "raftsmall":
+        return RaftSmall(description["iterations"])
+    raise ValueError(f"expected the network pwcnet or raftsmall, found {kind}")
+
+
+def loss_of(weighed, expected, truth):
+    """Weighed sum of end-point errors in pixels of the input, and the likelihood of the error head (exponential law)
+    for the last flow. `weighed` has flows [B, 2, H/n, W/n] in pixels with their weights."""
     total = 0.0
-    for level, flow in zip(levels_from(len(flows) + 1), flows):
-        cell = 2**level
-        error = (flow * cell - F.avg_pool2d(truth, cell)).square().sum(1, keepdim=True).add(1e-6).sqrt()
-        total = total + LEVEL_WEIGHTS[level] * error.mean()
+    for flow, weight in weighed:
+        cell = truth.shape[-1] // flow.shape[-1]
+        error = (flow - F.avg_pool2d(truth, cell)).square().sum(1, keepdim=True).add(1e-6).sqrt()
+        total = total + weight * error.mean()
     error = error.detach()
     return total, (torch.log(expected) + error / expected).mean(), error.mean()
 
@@ -63,16 +74,19 @@ class Run:
         torch.manual_seed(description["seed"])
         # Made on the CPU, so that a seed means the same weights on every kind of machine.
         with torch.device("cpu"):
-            network = PwcNet(description["coarsest"])
+            network = network_of(description)
+            if "start" in description:
+                network.published(description["start"])
         self.device = torch.get_default_device()
         self.network = network.to(self.device, memory_format=torch.channels_last)
         self.mean = copy.deepcopy(self.network).requires_grad_(False)
-        sharp = [p for n, p in self.network.named_parameters() if n.endswith("sharpness")]
-        rest = [p for n, p in self.network.named_parameters() if not n.endswith("sharpness")]
+        fast, rest = [], []
+        for name, parameter in self.network.named_parameters():
+            (fast if any(part in name for part in network.FAST) else rest).append(parameter)
         self.optimizer = torch.optim.AdamW(
             [
                 {"params": rest, "factor": 1.0, "weight_decay": description["weight_decay"]},
-                {"params": sharp, "factor": 10.0, "weight_decay": 0.0},
+                {"params": fast, "factor": 10.0, "weight_decay": 0.0},
             ],
             fused=True,
         )
@@ -100,6 +114,12 @@ class Run:
         """The crop stage in force: the last whose start is reached."""
         return [c for c in self.description["crops"] if c["from"] <= self.progress()][-1]
 
+    def noise(self, batch: int) -> torch.Tensor | None:
+        """Noise levels for a batch; none for a clean run."""
+        if self.description["clean"]:
+            return None
+        return levels(batch, self.description.get("darkest", DARKEST), self.description.get("towards_bright", 1.0))
+
     def train_step(self, older, newer, truth) -> tuple[torch.Tensor, torch.Tensor]:
         """One update; the loss and the end-point error of level 2, left where they were computed: reading a number
         makes the CPU wait for the GPU."""
@@ -108,7 +128,7 @@ class Run:
         older, newer = (f.contiguous(memory_format=torch.channels_last) for f in (older, newer))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.description["bf16"]):
             flows, expected = self.forward(older, newer)
-        loss, likelihood, error = loss_of(flows, expected, truth)
+        loss, likelihood, error = loss_of(self.network.weighed(flows), expected, truth)
         self.optimizer.zero_grad(set_to_none=True)
         (loss + 0.1 * likelihood).backward()
         average_gradients(self.network)
@@ -138,7 +158,8 @@ class Run:
             "mean": self.mean.state_dict(),
             "moments": {i: {n: narrow(n, v) for n, v in m.items()} for i, m in optimizer["state"].items()},
             "random": torch.get_rng_state(),
-            "coarsest": self.description["coarsest"],
+            "kind": self.description.get("network", "pwcnet"),
+            "coarsest": self.description.get("coarsest"),
             "step": self.step,
             "seconds": self.seconds,
         }
@@ -149,9 +170,11 @@ class Run:
     def load(self, folder: Path) -> None:
         """Goes on where `save` left off; the random numbers too, unless the leg before ran on another kind of machine."""
         state = checkpoints.load(folder)
-        if state["coarsest"] != self.description["coarsest"]:
+        wanted, found = self.description, (state["kind"], state["coarsest"])
+        if found != (wanted.get("network", "pwcnet"), wanted.get("coarsest")):
             raise ValueError(
-                f"{folder}: expected a network from level {self.description['coarsest']}, found one from {state['coarsest']}"
+                f"{folder}: expected a {wanted.get('network', 'pwcnet')} from level {wanted.get('coarsest')}, found a "
+                f"{found[0]} from level {found[1]}"
             )
         self.network.load_state_dict(state["network"])
         self.mean.load_state_dict(state["mean"])
@@ -168,16 +191,17 @@ class Run:
 
 
 @torch.no_grad()
-def judged(network: PwcNet, held: HeldOut) -> list[float]:
-    """Mean end-point error at full resolution for each noise level, in bf16 (a quick look, not the card's figure)."""
+def judged(network: nn.Module, held: HeldOut, bf16: bool) -> list[float]:
+    """Mean end-point error at full resolution for each noise level, a quick look and not the card's figure."""
     errors = []
+    network.eval()
     for level in JUDGED_LEVELS:
         older, newer = held.at(level)
         total = 0.0
         for i in range(0, len(older), 4):
-            with torch.autocast(older.device.type, torch.bfloat16):
-                flow = network(older[i : i + 4], newer[i : i + 4])[0][-1]
-            full = F.interpolate(4 * flow, scale_factor=4, mode="bilinear", align_corners=False)
+            with torch.autocast(older.device.type, torch.bfloat16, enabled=bf16):
+                flow, _ = network.weighed(network(older[i : i + 4], newer[i : i + 4])[0])[-1]
+            full = F.interpolate(flow, scale_factor=4, mode="bilinear", align_corners=False)
             total += (full - held.flow[i : i + 4]).norm(dim=1).mean((1, 2)).sum().item()
         errors.append(total / len(older))
     return errors
@@ -196,14 +220,17 @@ def leg(run: Run, folder: Path, packed: Path, minutes: float, every: float) -> N
     log = Log(folder / "log.csv", packed) if first else None
     if not first:  # Workers start from one checkpoint and must not draw the same scenes.
         torch.manual_seed(1000 * run.step + dist.get_rank())
+    mixture = run.description.get("displacements", MIXTURE)
     before, began, row_due, losses, over = run.seconds, time.monotonic(), run.seconds + 60 * every, [], False
     told, counted = began + 30, 0
+    if first and run.step == 0:
+        log.row(run, losses)
     while not over:
         crop = run.crop()
         # One step in fifty is timed part by part; the others are not waited for.
         timed = first and run.step % 50 == 20
         start = waited(run.device) if timed else 0.0
-        pairs = batch_of(textures, crop["batch"], crop["height"], crop["width"], clean=run.description["clean"])
+        pairs = batch_of(textures, crop["height"], crop["width"], run.noise(crop["batch"]), mixture, crop["batch"])
         made = waited(run.device) if timed else 0.0
         losses.append(run.train_step(*pairs))
         counted += crop["batch"]
@@ -234,9 +261,9 @@ class Log:
 
     def row(self, run: Run, losses: list[tuple[float, float]]) -> None:
         """Judges the running mean of the weights and writes where the run stands."""
-        loss, train = (torch.stack(values).mean().item() for values in zip(*losses))
+        loss, train = (torch.stack(values).mean().item() for values in zip(*losses)) if losses else (math.nan, math.nan)
         row = [run.step, f"{run.seconds / 60:.2f}", f"{loss:.3f}", f"{train:.3f}"]
-        row += [f"{e:.3f}" for e in judged(run.mean, self.held)] + [f"{self.zero:.3f}", f"{run.rate():.2e}"]
+        row += [f"{e:.3f}" for e in judged(run.mean, self.held, run.description["bf16"])] + [f"{self.zero:.3f}", f"{run.rate():.2e}"]
         with open(self.path, "a", newline="") as file:
             csv.writer(file, lineterminator="\n").writerow(row)
         print(*row, flush=True)

@@ -34,7 +34,7 @@ def one_thread():
 def steps(run: Run, textures: Textures, count: int) -> None:
     for _ in range(count):
         crop = run.crop()
-        run.train_step(*batch_of(textures, crop["batch"], crop["height"], crop["width"]))
+        run.train_step(*batch_of(textures, crop["height"], crop["width"], run.noise(crop["batch"])))
 
 
 def test_resumed_equals_straight_through(packed, tmp_path, one_thread):
@@ -88,8 +88,12 @@ def test_every_description_makes_a_run(description):
     if description.name == "pyproject.toml":
         return
     known = tomllib.loads(description.read_text())
-    assert set(known) == set(DESCRIPTION), "the same keys as every run"
-    run = Run(known)
+    kind = known.pop("network", "pwcnet")
+    own = {"pwcnet": {"coarsest"}, "raftsmall": {"iterations", "start"}}[kind]
+    extra = {"darkest", "towards_bright", "displacements"}
+    assert set(known) - extra == set(DESCRIPTION) - {"coarsest"} | own, "the same keys as every run"
+    known.pop("start", None)
+    run = Run(known | {"network": kind})
     assert run.crop()["height"] % 64 == 0 and run.crop()["width"] % 64 == 0 and run.progress() == 0
 
 
@@ -104,19 +108,20 @@ def test_minutes_make_a_schedule_too():
 def test_a_leg_writes_its_log_and_a_checkpoint(packed, tmp_path):
     run = Run(DESCRIPTION | {"schedule": {"steps": 2}})
     leg(run, tmp_path, packed, minutes=10, every=10)
-    heading, row = (tmp_path / "log.csv").read_text().splitlines()
-    assert heading.startswith("step,minutes,loss") and row.startswith("2,")
+    heading, first, row = (tmp_path / "log.csv").read_text().splitlines()
+    assert heading.startswith("step,minutes,loss") and first.startswith("0,") and row.startswith("2,")
     assert len(row.split(",")) == len(heading.split(","))
     again = Run(DESCRIPTION)
     again.load(tmp_path / "checkpoint")
     assert again.step == 2
 
 
-def test_a_few_pairs_are_learned_by_heart(packed):
+@pytest.mark.parametrize("description", [{}, {"network": "raftsmall", "iterations": 3}], ids=["pwcnet", "raftsmall"])
+def test_a_few_pairs_are_learned_by_heart(packed, description):
     torch.manual_seed(4)
     textures = Textures(packed, held_out=False)
-    pairs = batch_of(textures, 2, 64, 64, level=5)
-    run = Run(DESCRIPTION | {"peak_rate": 1e-3, "schedule": {"steps": 120}})
+    pairs = batch_of(textures, 64, 64, torch.full((2,), 5.0))
+    run = Run(DESCRIPTION | {"peak_rate": 1e-3, "schedule": {"steps": 120}} | description)
     zero = pairs[2].norm(dim=1).mean().item()
     for _ in range(90):
         _, error = run.train_step(*pairs)
@@ -126,7 +131,7 @@ def test_a_few_pairs_are_learned_by_heart(packed):
 def test_judging_does_not_move_the_random_state(packed):
     network, held = Run(DESCRIPTION).mean, HeldOut(packed, count=2, height=64, width=64)
     before = torch.get_rng_state()
-    assert len(judged(network, held)) == 4
+    assert len(judged(network, held, bf16=False)) == 5
     assert torch.equal(before, torch.get_rng_state())
 
 
