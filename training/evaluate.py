@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from export import Exported
 from pairs import HeldOut, linear, noisy, public_pairs
 
-NOISE_LEVELS = (0, 10, 20, 30)
+NOISE_LEVELS = (0, 10, 20, 30, 60)
 SPEEDS = ((0, 1), (1, 4), (4, 8), (8, 16), (16, 1000))
 CELL = 4
 
@@ -116,7 +116,8 @@ def curve_picture(log: Path, target: Path) -> None:
     with open(log) as file:
         rows = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
     width, height, left, bottom = 640, 320, 50, 40
-    longest, highest = max(r["minutes"] for r in rows), rows[0]["zero_flow"] * 1.05
+    names = [key for key in rows[0] if key.startswith("epe_")]
+    longest, highest = max(r["minutes"] for r in rows), 1.05 * max(r[key] for r in rows for key in names)
 
     def place(minutes: float, error: float) -> tuple[float, float]:
         x = left + minutes / longest * (width - left - 130)
@@ -126,18 +127,19 @@ def curve_picture(log: Path, target: Path) -> None:
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" font-family="sans-serif" '
         'font-size="12"><rect width="100%" height="100%" fill="white"/>'
     ]
-    for error in range(int(highest) + 1):
+    step = 1 if highest > 3 else 0.5
+    for error in (step * i for i in range(int(highest / step) + 1)):
         (x0, y), (x1, _) = place(0, error), place(longest, error)
         parts.append(f'<path d="M{x0:.1f} {y:.1f}H{x1:.1f}" stroke="#ddd"/>')
-        parts.append(f'<text x="{x0 - 16}" y="{y + 4:.1f}">{error}</text>')
+        parts.append(f'<text x="{x0 - 24}" y="{y + 4:.1f}">{error}</text>')
     for minute in range(0, int(longest) + 1, 10):
         x, y = place(minute, 0)
         parts.append(f'<text x="{x - 6:.1f}" y="{y + 16:.1f}">{minute}</text>')
     parts.append(f'<text x="{left + 130}" y="{height - 8}">minutes of training</text>')
     parts.append('<text x="4" y="12">px</text>')
-    series = [("epe_0", "noise 0", "#1b7837"), ("epe_10", "noise 10", "#2166ac"), ("epe_20", "noise 20", "#b2182b"),
-              ("epe_30", "noise 30", "#000000"), ("zero_flow", "zero flow", "#999999")]
-    for i, (key, name, colour) in enumerate(series):
+    colours = ("#1b7837", "#2166ac", "#b2182b", "#000000", "#e08214")
+    for i, (key, colour) in enumerate(zip(names, colours)):
+        name = key.replace("epe_", "noise ")
         points = " ".join("{:.1f},{:.1f}".format(*place(r["minutes"], r[key])) for r in rows)
         parts.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.5"/>')
         parts.append(f'<text x="{width - 120}" y="{20 + 18 * i}" fill="{colour}">{name}: {rows[-1][key]:.2f}</text>')
@@ -145,7 +147,7 @@ def curve_picture(log: Path, target: Path) -> None:
 
 
 def main() -> None:
-    """Command line; writes `evaluation.md` beside the graphs."""
+    """Command line; writes `NAME_evaluation.md` and the learning curve beside the graphs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--models", type=Path, default=Path("../models"))
     parser.add_argument("--name", default="pwcnet_fcdn")
@@ -181,7 +183,7 @@ def main() -> None:
                     score.add(graphs, *dark, truth[0].permute(1, 2, 0).numpy())
             lines += error_table(title, scores, len(chosen))
     curve_picture(arguments.log, arguments.models / f"{arguments.name}_curve.svg")
-    (arguments.models / "evaluation.md").write_text("\n".join(lines))
+    (arguments.models / f"{arguments.name}_evaluation.md").write_text("\n".join(lines))
     print("\n".join(lines))
 
 

@@ -43,9 +43,14 @@ fn full() -> Config {
     Config { resolution: Resolution::Full, ..Config::default() }
 }
 
-/// The real network, if its golden check passes.
+/// A real network, if its golden check passes.
+fn named(network: &str) -> Matcher {
+    let config = Config { network: network.into(), ..Config::default() };
+    Matcher::open(&config).expect("the committed network opens and passes its golden check")
+}
+
 fn real() -> Matcher {
-    Matcher::open(&Config::default()).expect("the committed model opens and passes its golden check")
+    named(&Config::default().network)
 }
 
 #[test]
@@ -273,15 +278,21 @@ fn every_cause_is_named_with_its_figure() {
 }
 
 #[test]
-fn the_committed_model_passes_its_golden_check() {
-    let mut matcher = real();
-    let deviation = matcher.check_golden().unwrap().expect("the manifest holds a golden output");
-    assert!(deviation.worst <= deviation.tolerance);
-    let model = matcher.model();
-    assert_eq!(model.name, "pwcnet_fcdn");
-    assert!(model.provider.starts_with("CPUExecutionProvider of ONNX Runtime 1."), "{model:?}");
-    assert_eq!(model.sha256.len(), 2);
-    assert!(model.sha256.iter().all(|(file, hash)| file.ends_with(".onnx") && hash.len() == 64));
+fn every_committed_network_passes_its_golden_check() {
+    assert_eq!(real().model().name, "pwcnet_fcdn");
+    let manifest = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/models/manifest.toml")).unwrap();
+    for name in manifest.parse::<toml::Table>().unwrap().keys() {
+        let mut matcher = named(name);
+        let deviation = matcher.check_golden().unwrap().expect("the manifest holds a golden output");
+        assert!(deviation.worst <= deviation.tolerance);
+        let model = matcher.model();
+        assert_eq!(&model.name, name);
+        assert!(model.provider.starts_with("CPUExecutionProvider of ONNX Runtime 1."), "{model:?}");
+        assert!(
+            model.sha256.len() == 2
+                && model.sha256.iter().all(|(file, hash)| file.ends_with(".onnx") && hash.len() == 64)
+        );
+    }
 }
 
 /// Lends one place, and remembers where that was.
@@ -304,9 +315,12 @@ impl Lender for Watched {
 }
 
 #[test]
-fn the_network_writes_into_the_lent_memory_and_copies_once_where_it_must_cut() {
-    let mut matcher = real();
-    for (width, height, copied) in [(128, 64, 0), (100, 60, 1)] {
+fn a_network_writes_into_the_lent_memory_and_copies_once_where_it_must_cut() {
+    let sizes = [(128, 64, 0), (100, 60, 1)];
+    for (name, (width, height, copied)) in
+        ["pwcnet_fcdn", "raftsmall_fcdn_4"].into_iter().flat_map(|n| sizes.map(|s| (n, s)))
+    {
+        let mut matcher = named(name);
         let before = matcher.counts();
         let (older, newer) = (frame(width, height, (0.0, 0.0), 1), frame(width, height, (1.0, 1.0), 2));
         let mut lender = Watched::default();
@@ -324,9 +338,13 @@ fn the_network_writes_into_the_lent_memory_and_copies_once_where_it_must_cut() {
 }
 
 #[test]
-fn the_real_network_keeps_features_and_gives_the_same_bits_again() {
+fn a_real_network_keeps_features_and_gives_the_same_bits_again() {
+    ["pwcnet_fcdn", "raftsmall_fcdn_4"].into_iter().for_each(gives_the_same_bits_again);
+}
+
+fn gives_the_same_bits_again(network: &str) {
     let frames: Vec<_> = (1..=4).map(|n| frame(128, 128, (n as f64, -0.5 * n as f64), n)).collect();
-    let mut matcher = real();
+    let mut matcher = named(network);
     let mut run = || {
         let mut all = Vec::new();
         for two in frames.windows(2) {
@@ -340,7 +358,7 @@ fn the_real_network_keeps_features_and_gives_the_same_bits_again() {
     assert_eq!(described, 4);
     let (second, _) = run();
     assert_eq!(first, second);
-    let mut fresh = real();
+    let mut fresh = named(network);
     let mut own = Own::default();
     let flow = fresh.between(&pair(&frames[2], &frames[3]), &mut own).unwrap();
     let last: Vec<u32> = flow.vectors.iter().chain(flow.confidence).map(|value| value.to_bits()).collect();
@@ -400,7 +418,7 @@ fn a_missing_network_or_manifest_is_named() {
     let folder = models();
     let config = Config { models: folder.path().into(), network: "raft".into(), ..Config::default() };
     let text = Matcher::open(&config).map(drop).unwrap_err().to_string();
-    assert!(text.contains("network raft is not in it, it has pwcnet_fcdn"), "{text}");
+    assert!(text.contains("network raft is not in it, it has pwcnet_fcdn, raftsmall_fcdn"), "{text}");
     fs::remove_file(folder.path().join("manifest.toml")).unwrap();
     let text = refusal(folder.path());
     insta::assert_snapshot!(text, @"MODELS/manifest.toml: No such file or directory (os error 2); set [flow] models to the folder of the models");
