@@ -180,9 +180,8 @@ class RaftSmall(nn.Module):
         around = torch.stack([padded[:, :, y : y + rows, x : x + columns] for y, x in shifts], 2).unsqueeze(2)
         return F.pixel_shuffle((weights * around).sum(3).flatten(1, 2), 2)
 
-    def pair(self, older, newer, context: Tensor):
-        """Features of both frames and the older one's context to the flows [B, 2, H/4, W/4] after each iteration, in
-        pixels of the image, and the expected end-point error [B, 1, H/4, W/4]. In evaluation only the last flow."""
+    def steps(self, older: Tensor, newer: Tensor, context: Tensor):
+        """After each iteration the flow [B, 2, h, w] in pixels of an eighth, and the recurrent state."""
         batch, channels = older.shape[:2]
         products = older.flatten(2).transpose(1, 2) @ newer.flatten(2) / channels**0.5
         volumes = [products.view(-1, 1, *newer.shape[-2:])]
@@ -195,14 +194,20 @@ class RaftSmall(nn.Module):
             torch.arange(rows, device=older.device), torch.arange(columns, device=older.device), indexing="ij"
         )
         home = torch.stack([x, y]).to(older.dtype).unsqueeze(0)
-        places, flows = home.expand(batch, -1, -1, -1), []
-        for i in range(self.iterations):
+        places = home.expand(batch, -1, -1, -1)
+        for _ in range(self.iterations):
             places = places.detach()
             moved = self.update_block.encoder(places - home, self.look(volumes, places))
             state = self.update_block.gru(state, torch.cat([context, moved], 1))
             places = places + self.update_block.flow_head(state)
-            if self.training or i + 1 == self.iterations:
-                flows.append(self.quarter(places - home, state))
+            yield places - home, state
+
+    def pair(self, older, newer, context: Tensor):
+        """Features of both frames and the older one's context to the flows [B, 2, H/4, W/4] after each iteration, in
+        pixels of the image, and the expected end-point error [B, 1, H/4, W/4]. In evaluation only the last flow."""
+        steps = list(self.steps(older, newer, context))
+        flows = [self.quarter(*step) for step in (steps if self.training else steps[-1:])]
+        state = steps[-1][1]
         expected = F.softplus(F.pixel_shuffle(self.error(state.detach()), 2)) + 0.01
         return flows, expected
 
