@@ -62,8 +62,10 @@ pub struct Config {
     pub seed_rad: f64,
     /// No vector agrees that is further off than this angle.
     pub agree_rad_max: f64,
-    /// Flow error that all vectors of a step share, camera pixels.
-    pub flow_shared_sd_px: f64,
+    /// Flow error that all vectors of a step share, in widths of the frame.
+    pub flow_shared_sd_widths: f64,
+    /// Flow error that all vectors of a step share, as a part of their length.
+    pub flow_shared_sd_part: f64,
     /// Seed of the random draws.
     pub seed: u32,
 }
@@ -131,7 +133,8 @@ impl Default for Config {
             inlier_part_min: 0.25,
             seed_rad: 0.004,
             agree_rad_max: 0.015,
-            flow_shared_sd_px: 0.02,
+            flow_shared_sd_widths: 1.5e-4,
+            flow_shared_sd_part: 0.005,
             seed: 1,
         }
     }
@@ -170,6 +173,10 @@ pub const REASONS: &[(&str, &str)] = &[
     ("inlier_part_min", "where fewer than a quarter agree, another plane may be the larger one"),
     ("seed_rad", "one and a half pixels of the network's image at its usual field of view"),
     ("agree_rad_max", "beyond six such pixels nothing is noise, whatever the spread of the rest"),
-    ("flow_shared_sd_px", "shift between neighbouring real frames that remains in the mean over the image"),
+    (
+        "flow_shared_sd_widths",
+        "0.05 of the network's 320 pixels: what residuals can't show, for the fit takes it for motion (benches/velocity)",
+    ),
+    ("flow_shared_sd_part", "the same bench, where the displacement is long"),
     ("seed", "any number: what counts is that it stays the same"),
 ];

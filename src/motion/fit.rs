@@ -28,10 +28,10 @@ pub(super) struct Sight {
     pub(super) slope: f64,
     /// Inverse variance by the confidence, relative.
     pub(super) weight: f64,
-    /// Confidence as given.
-    pub(super) confidence: f64,
     /// Vectors that were left out keep their place in the raster.
     pub(super) offered: bool,
+    /// Length of the vector as it was seen, turn and all.
+    pub(super) stretch: f64,
     pub(super) residual: [f64; 2],
     pub(super) agrees: bool,
 }
@@ -72,8 +72,9 @@ pub(super) struct Found {
     pub(super) by_normal: Matrix3<f64>,
     pub(super) samples: u32,
     pub(super) inliers: u32,
-    /// Mean confidence of those that agree.
-    pub(super) confidence: f64,
+    /// Root mean square of the length of those that agree, as they were seen: what an error of the network's that grows
+    /// with the displacement grows with.
+    pub(super) stretch: f64,
 }
 
 /// The raster of vectors and its scratch memory, kept from step to step.
@@ -84,6 +85,8 @@ pub(super) struct Fit {
     /// The thinned raster, row by row.
     pub(super) sights: Vec<Sight>,
     scratch: Vec<f64>,
+    /// Residuals over their spread, place by place; NaN where none agrees.
+    scaled: Vec<[f64; 2]>,
     offered: Vec<u32>,
 }
 
@@ -187,10 +190,10 @@ impl Fit {
 
     /// The estimate's covariance by its own residuals (a sandwich: it holds where the confidences are wrong too), and
     /// its first-order change with everything that all vectors share.
-    fn linearise(&self, tau: Vector3<f64>, spread: f64, samples: u32, inliers: u32) -> Option<Found> {
+    fn linearise(&mut self, tau: Vector3<f64>, spread: f64, samples: u32, inliers: u32) -> Option<Found> {
         let (mut slope, mut noise) = (Matrix3::zeros(), Matrix3::zeros());
         let (mut by_turn, mut by_shift, mut by_normal) = (Matrix3::zeros(), Matrix3x2::zeros(), Matrix3::zeros());
-        let mut confidence = 0.0;
+        let mut stretch = 0.0;
         for sight in self.sights.iter().filter(|sight| sight.offered && sight.agrees) {
             let rows = sight.rows();
             let bent = rows.transpose() * tukey_slope(sight, spread);
@@ -203,7 +206,7 @@ impl Fit {
             let (ox, oy) = (sight.older[0], sight.older[1]);
             let per_slope = Vector2::new(-tau.x + x * tau.z, -tau.y + y * tau.z);
             by_normal += bent * per_slope * Vector3::new(ox, oy, 1.0).transpose();
-            confidence += sight.confidence;
+            stretch += sight.stretch * sight.stretch;
         }
         let inverse = invert(&slope)?;
         let count = f64::from(inliers);
@@ -216,32 +219,54 @@ impl Fit {
             by_normal: inverse * by_normal,
             samples,
             inliers,
-            confidence: confidence / count,
+            stretch: (stretch / count).sqrt(),
         })
     }
 
-    /// How many vectors stand for one independent vector: neighbours' residuals that are alike carry no new knowledge.
-    /// Taken as a first-order autoregression along columns and rows.
-    fn likeness(&self) -> f64 {
-        let agrees = |i: usize| self.sights.get(i).filter(|sight| sight.offered && sight.agrees);
+    /// How many vectors stand for one independent vector: residuals that are alike carry no new knowledge.
+    ///
+    /// The sum of the residuals' autocorrelation over all distances, taken as separable along columns and rows. Each
+    /// sum ends where the correlation first falls to zero (Geyer's initial positive sequence): a network's error is
+    /// smooth over several cells and then ends, so that neither its nearest neighbours (as a first-order autoregression
+    /// would have it, three times too many) nor blocks of the image (too few) say how far it reaches.
+    fn likeness(&mut self) -> f64 {
+        self.scaled.clear();
+        self.scaled.extend(self.sights.iter().map(|sight| match sight.offered && sight.agrees {
+            true => sight.residual.map(|off| off * sight.weight.sqrt()),
+            false => [f64::NAN; 2],
+        }));
+        let rows = self.sights.len() / self.columns.max(1);
         let mut factor = 1.0;
-        for (stride, along_row) in [(1, true), (self.columns, false)] {
-            let (mut product, mut square) = (0.0, 0.0);
-            for i in 0..self.sights.len() {
-                if along_row && (i + 1) % self.columns == 0 {
-                    continue;
+        for (along_row, cells) in [(true, self.columns), (false, rows)] {
+            let mut sum = 1.0;
+            for lag in 1..cells {
+                let correlation = if along_row { self.alike(lag, lag) } else { self.alike(lag * self.columns, 0) };
+                if correlation <= 0.0 {
+                    break;
                 }
-                let (Some(a), Some(b)) = (agrees(i), agrees(i + stride)) else { continue };
-                let scale = (a.weight * b.weight).sqrt();
-                product += scale * (a.residual[0] * b.residual[0] + a.residual[1] * b.residual[1]);
-                square += 0.5 * (a.weight * a.length().powi(2) + b.weight * b.length().powi(2));
+                sum += 2.0 * correlation * (1.0 - lag as f64 / cells as f64);
             }
-            if square > 0.0 {
-                let correlation = (product / square).clamp(0.0, 0.95);
-                factor *= (1.0 + correlation) / (1.0 - correlation);
-            }
+            factor *= sum;
         }
         factor
+    }
+
+    /// Correlation of the residuals of vectors that lie `apart` places from each other in the raster; the last `edge`
+    /// columns have no partner in their row.
+    fn alike(&self, apart: usize, edge: usize) -> f64 {
+        let (mut product, mut square) = (0.0, 0.0);
+        let partners = self.scaled.get(apart..).unwrap_or_default();
+        let both = self.scaled.chunks(self.columns).zip(partners.chunks(self.columns));
+        for (here, there) in both {
+            for ([ax, ay], [bx, by]) in here.iter().zip(there).take(self.columns - edge) {
+                let pair = ax * bx + ay * by;
+                if pair.is_finite() {
+                    product += pair;
+                    square += 0.5 * (ax * ax + ay * ay + bx * bx + by * by);
+                }
+            }
+        }
+        if square > 0.0 { product / square } else { 0.0 }
     }
 }
 

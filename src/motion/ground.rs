@@ -94,21 +94,22 @@ impl Ranges {
             (Some(a), Some(b)) => {
                 let part = older.seconds_since(a.stamp) / b.stamp.seconds_since(a.stamp);
                 let range = a.checked()? * (1.0 - part) + b.checked()? * part;
-                Ok(Beam { range, variance: noise(b, range, config) })
+                let variance = (1.0 - part).powi(2) * noise(a, config) + part.powi(2) * noise(b, config);
+                Ok(Beam { range, variance })
             }
             (Some(only), None) | (None, Some(only)) => {
                 let range = only.checked()?;
                 let climbed = config.climb_sd_m_s * older.seconds_since(only.stamp);
-                Ok(Beam { range, variance: noise(only, range, config) + climbed * climbed })
+                Ok(Beam { range, variance: noise(only, config) + climbed * climbed })
             }
             (None, None) => Err(NoDistance::Old { age_s, allowed_s: config.range_age_s_max }),
         }
     }
 }
 
-fn noise(reach: &Reach, range: f64, config: &Config) -> f64 {
+fn noise(reach: &Reach, config: &Config) -> f64 {
     if reach.variance.is_finite() && reach.variance > 0.0 {
         return reach.variance;
     }
-    config.range_sd_m.powi(2) + (config.range_sd_part * range).powi(2)
+    config.range_sd_m.powi(2) + (config.range_sd_part * reach.range).powi(2)
 }

@@ -12,9 +12,11 @@ mod ground;
 mod gyro;
 mod lens;
 mod odometer;
+mod quality;
 
 pub use config::{AttitudeUse, Config, GyroUse, Mount, REASONS};
 pub use odometer::Odometer;
+pub use quality::{BOUND_M_S, BOUND_PART, BOUND_PER_S};
 
 use crate::clock::Stamp;
 
@@ -41,8 +43,9 @@ pub struct Velocity {
     pub samples: u32,
     /// Flow vectors that agreed.
     pub inliers: u32,
-    /// 0 none … 255: 255 × part of the vectors that agree × their mean confidence. Provisional: it orders steps of one
-    /// flight, and is no probability.
+    /// 255 × the probability that `linear` is within [`BOUND_M_S`] + [`BOUND_PART`] of the speed of the truth (length of
+    /// the error in all three directions; [`BOUND_PER_S`] where it is per distance). It follows from the covariance,
+    /// means the same by day and by night, and is held against simulated flights by `benches/velocity`.
     pub quality: u8,
 }
 

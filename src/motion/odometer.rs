@@ -8,6 +8,7 @@ use super::{
     ground::Ranges,
     gyro::{Rates, Turn},
     lens::Lens,
+    quality,
 };
 use crate::{
     flow::{Flow, Grid},
@@ -119,7 +120,9 @@ impl Odometer {
         self.look(flow, &turn, &ground.normal);
         let seed = u64::from(self.config.seed) ^ flow.older.ns().cast_unsigned();
         let found = self.fit.solve(&self.config, seed)?;
-        Ok(self.conclude(flow, &turn, &ground, &found, interval_s, focal))
+        let constant = self.config.flow_shared_sd_widths * f64::from(camera_size[0]) / focal;
+        let shared = (constant.powi(2) + (self.config.flow_shared_sd_part * found.stretch).powi(2)).sqrt();
+        Ok(self.conclude(flow, &turn, &ground, &found, interval_s, shared))
     }
 
     /// How the body turned, or how it may have where that need not be known.
@@ -198,8 +201,9 @@ impl Odometer {
             }
             // A probability p of being right to within a pixel is a Gaussian of variance −1 / (2 ln(1 − p)) px².
             let weight = -2.0 * (1.0 - confidence.min(0.999)).ln();
+            let stretch = ((newer[0] - older[0]).powi(2) + (newer[1] - older[1]).powi(2)).sqrt();
             let newer = [turned.x / turned.z, turned.y / turned.z];
-            Some(Sight { older, newer, slope, weight, confidence, offered: true, ..Sight::default() })
+            Some(Sight { older, newer, slope, weight, stretch, offered: true, ..Sight::default() })
         };
         self.fit.columns = columns().count();
         self.fit.sights.clear();
@@ -216,7 +220,7 @@ impl Odometer {
         ground: &Ground,
         found: &Found,
         interval_s: f64,
-        focal: f64,
+        shared: f64,
     ) -> Velocity {
         let config = &self.config;
         let forward = turn.rotation.inverse();
@@ -232,7 +236,7 @@ impl Odometer {
         let to_body = to_newer.matrix() * scale;
         spread.linear(&(to_body * found.covariance * to_body.transpose()));
         for column in found.by_shift.column_iter() {
-            spread.error(to_body * column * (config.flow_shared_sd_px / focal), Vector3::zeros());
+            spread.error(to_body * column * shared, Vector3::zeros());
         }
         // An error of the turn, in the older body's axes, as it reaches the velocity and the mean rate.
         let by_turn = to_body * found.by_turn * self.mount.inverse().matrix();
@@ -261,20 +265,20 @@ impl Odometer {
         if config.gyro == GyroUse::IfPresent && self.rates.turn(flow.older, flow.newer, config).is_err() {
             spread.unobserved();
         }
-        let share = f64::from(found.inliers) / f64::from(found.samples.max(1));
+        let scale = match &ground.distance {
+            Ok(d) => Scale::Metric { distance: d.metres },
+            Err(why) => Scale::PerDistance(*why),
+        };
         Velocity {
             older: flow.older,
             newer: flow.newer,
             linear: linear.into(),
             angular: turn.mean.into(),
             covariance: spread.rows(),
-            scale: match &ground.distance {
-                Ok(d) => Scale::Metric { distance: d.metres },
-                Err(why) => Scale::PerDistance(*why),
-            },
+            scale,
             samples: found.samples,
             inliers: found.inliers,
-            quality: (255.0 * share * found.confidence.min(1.0)).round() as u8,
+            quality: quality::of(&linear, &spread.0.fixed_view::<3, 3>(0, 0).into(), &scale),
         }
     }
 }

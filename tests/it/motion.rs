@@ -5,7 +5,9 @@ use nightflow::{
     clock::Stamp,
     darkness::noise::Normals,
     flow::{Flow, Grid},
-    motion::{Config, Error, GyroUse, Lack, Mount, NoDistance, Odometer, REASONS, Scale, Velocity},
+    motion::{
+        BOUND_M_S, BOUND_PART, Config, Error, GyroUse, Lack, Mount, NoDistance, Odometer, REASONS, Scale, Velocity,
+    },
     wire::{CameraInfo, Header, Imu, Quaternion, Range, Vector3 as Wire3},
 };
 
@@ -249,9 +251,10 @@ fn the_imu_may_be_mounted_askew() {
 }
 
 /// Noise as the settings state it, 30 % of the vectors wrong by tens of pixels: the error must be as large as the
-/// covariance says.
+/// covariance says, and as often within the bound as the quality says.
 fn honesty(camera: Mount, correlated: bool) -> (f64, f64, f64) {
     let (mut linear, mut all, mut worst) = (0.0, 0.0, 0.0_f64);
+    let (mut quality, mut hits) = (0.0, 0.0);
     let rounds = 400;
     for round in 0..rounds {
         let mut draws = Normals::new(77, round);
@@ -263,7 +266,7 @@ fn honesty(camera: Mount, correlated: bool) -> (f64, f64, f64) {
         truth.attitude = UnitQuaternion::from_scaled_axis(three(0.05));
         let mut seen = truth.exact();
         let noise: Vec<f64> = (0..2 * GRID.cells()).map(|_| draws.draw()).collect();
-        let shared = [draws.draw(), draws.draw()].map(|n| n * truth.config.flow_shared_sd_px);
+        let shared = [draws.draw(), draws.draw()].map(|n| n * truth.config.flow_shared_sd_widths * f64::from(SIZE[0]));
         for cell in 0..GRID.cells() {
             let wrong = draws.uniform() < 0.3;
             for (axis, shared) in shared.iter().enumerate() {
@@ -288,8 +291,12 @@ fn honesty(camera: Mount, correlated: bool) -> (f64, f64, f64) {
         let both = nalgebra::Vector6::new(error.x, error.y, error.z, turn.x, turn.y, turn.z);
         all += (both.transpose() * covariance.try_inverse().unwrap() * both)[0] / 6.0;
         worst = worst.max(error.norm());
+        quality += f64::from(found.quality) / 255.0;
+        hits += f64::from(u8::from(error.norm() <= BOUND_M_S + BOUND_PART * truth.velocity.norm()));
         assert!(found.inliers > found.samples / 2, "{found:?}");
     }
+    let [quality, hits] = [quality, hits].map(|sum| sum / rounds as f64);
+    assert!((quality - hits).abs() < 0.06, "a quality of {quality:.3} beside {hits:.3} within the bound");
     (linear / rounds as f64, all / rounds as f64, worst)
 }
 

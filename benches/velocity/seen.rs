@@ -1,0 +1,217 @@
+//! What the stages before the odometer make of a flight, kept in files so that a change of the fit needs no new flow.
+
+use std::{
+    fs,
+    io::{Read, Write},
+    path::Path,
+};
+
+use nightflow::{
+    clock::Stamp,
+    config::Config,
+    darkness::{flight, ladder::MEANS, noise::Noise},
+    exposure::Developer,
+    flow::{Flow, Grid, Matcher, Own, State},
+};
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+
+use super::flights::{Flown, Plan, Sensors, fly};
+
+/// Stamps of one flight at one exposure lie this far from those of the next, so that no features are taken for others'.
+const APART_NS: i64 = 100_000_000_000;
+
+/// The flow of one step.
+#[derive(Debug, Clone, Default)]
+pub struct Step {
+    /// Whether the node would say that it sees nothing.
+    pub blind: bool,
+    /// Deviation of the noise in the developed image at a mean of 0.4, in 1/255; NaN where it is not known.
+    pub noise_level: f32,
+    /// Where the vectors stand.
+    pub grid: Grid,
+    /// As in [`Flow`].
+    pub vectors: Vec<f32>,
+    /// As in [`Flow`].
+    pub confidence: Vec<f32>,
+}
+
+impl Step {
+    /// The step as the odometer takes it.
+    pub fn flow(&self, older: Stamp, newer: Stamp) -> Flow<'_> {
+        Flow { older, newer, grid: self.grid, vectors: &self.vectors, confidence: &self.confidence }
+    }
+}
+
+/// A flight as a network saw it: steps by exposure.
+pub type Seen = [Vec<Step>; MEANS.len()];
+
+#[derive(Serialize, Deserialize)]
+struct Kept {
+    width: usize,
+    height: usize,
+    scale: [f32; 2],
+    /// Blindness and noise level, exposure by exposure.
+    steps: Vec<Vec<(bool, Option<f32>)>>,
+}
+
+/// Settings of the node for the flights' camera.
+pub fn settings(network: &str) -> Config {
+    let mut config = Config::default();
+    config.exposure.bit_depth = Some(12);
+    config.exposure.black_level = Some(f32::from(flight::BLACK));
+    config.exposure.white_level = Some(f32::from(flight::WHITE));
+    config.flow.network = network.into();
+    config.flow.threads = 1;
+    config
+}
+
+/// A flight whose frames are drawn or read when they are asked for.
+pub struct Taken<'a> {
+    /// All but the frames.
+    pub sensors: Sensors,
+    frames: Option<Flown>,
+    cache: Option<&'a Path>,
+}
+
+impl<'a> Taken<'a> {
+    /// Flies, or reads what was flown before.
+    pub fn new(plan: Plan, cache: Option<&'a Path>) -> Result<Self, String> {
+        let path = cache.map(|folder| folder.join(format!("sensors_{:05}", plan.number)));
+        if let Some((sensors, _)) = path.as_deref().and_then(read::<Sensors>)
+            && sensors.plan == plan
+        {
+            return Ok(Self { sensors, frames: None, cache });
+        }
+        let flown = fly(plan)?;
+        if let Some(folder) = cache {
+            let bytes: Vec<u8> = flown.frames.iter().flatten().flat_map(|count| count.to_le_bytes()).collect();
+            write(&folder.join(format!("clean_{:05}", plan.number)), &(), &bytes)?;
+            write(&folder.join(format!("sensors_{:05}", plan.number)), &flown.sensors, &[])?;
+        }
+        Ok(Self { sensors: flown.sensors.clone(), frames: Some(flown), cache })
+    }
+
+    fn flown(&mut self) -> Result<&Flown, String> {
+        let Self { sensors, frames, cache } = self;
+        if frames.is_none() {
+            let path = cache.map(|folder| folder.join(format!("clean_{:05}", sensors.plan.number)));
+            *frames = Some(match path.as_deref().and_then(read::<()>) {
+                Some(((), bytes)) => {
+                    let counts: Vec<u16> =
+                        bytes.as_chunks::<2>().0.iter().map(|two| u16::from_le_bytes(*two)).collect();
+                    let frames = counts.chunks(sensors.plan.size[0] * sensors.plan.size[1]).map(<[u16]>::to_vec);
+                    Flown { sensors: sensors.clone(), frames: frames.collect() }
+                }
+                None => fly(sensors.plan)?,
+            });
+        }
+        frames.as_ref().ok_or_else(|| "no frames".to_owned())
+    }
+
+    /// What the method sees of the flight at every exposure; the matcher is opened when it is needed.
+    pub fn seen_by(&mut self, name: &str, matcher: &mut Option<Matcher>, camera: &Noise) -> Result<Seen, String> {
+        let plan = self.sensors.plan;
+        let path = self.cache.map(|folder| folder.join(format!("{name}_{:05}", plan.number)));
+        if let Some((kept, bytes)) = path.as_deref().and_then(read::<Kept>)
+            && kept.steps.iter().all(|steps| steps.len() == plan.steps)
+        {
+            return Ok(unpack(&kept, &bytes));
+        }
+        let config = settings(name);
+        let matcher = match matcher {
+            Some(matcher) => matcher,
+            None => matcher.insert(Matcher::open(&config.flow).map_err(|error| error.to_string())?),
+        };
+        let flown = self.flown()?;
+        let mut seen = Seen::default();
+        for (rung, steps) in seen.iter_mut().enumerate() {
+            *steps = look(flown, rung, &config, matcher, camera)?;
+        }
+        if let Some(path) = path {
+            let (kept, bytes) = pack(&seen);
+            write(&path, &kept, &bytes)?;
+        }
+        Ok(seen)
+    }
+}
+
+fn look(
+    flown: &Flown,
+    rung: usize,
+    config: &Config,
+    matcher: &mut Matcher,
+    camera: &Noise,
+) -> Result<Vec<Step>, String> {
+    let mut developer = Developer::new(&config.exposure).map_err(|error| error.to_string())?;
+    let (mut own, mut steps) = (Own::default(), vec![]);
+    let shift = (flown.sensors.plan.number as i64 * MEANS.len() as i64 + rung as i64) * APART_NS;
+    for (index, moment) in flown.sensors.truth.iter().enumerate() {
+        let frame = flown.photograph(index, rung, camera, Stamp(moment.stamp.ns() + shift));
+        developer.develop(&frame).map_err(|error| error.to_string())?;
+        let Some(pair) = developer.pair() else { continue };
+        let flow = matcher.between(&pair, &mut own).map_err(|error| error.to_string())?;
+        let (state, _) = matcher.judge(&pair, &flow);
+        steps.push(Step {
+            blind: matches!(state, State::Blind(_)),
+            noise_level: pair.newer.noise_level.unwrap_or(f32::NAN),
+            grid: flow.grid,
+            vectors: flow.vectors.to_vec(),
+            confidence: flow.confidence.to_vec(),
+        });
+    }
+    Ok(steps)
+}
+
+fn pack(seen: &Seen) -> (Kept, Vec<u8>) {
+    let grid = seen[0].first().map_or(Grid::default(), |step| step.grid);
+    let known = |level: f32| level.is_finite().then_some(level);
+    let of = |steps: &Vec<Step>| steps.iter().map(|step| (step.blind, known(step.noise_level))).collect();
+    let kept = Kept { width: grid.width, height: grid.height, scale: grid.scale, steps: seen.iter().map(of).collect() };
+    let values = seen.iter().flatten().flat_map(|step| step.vectors.iter().chain(&step.confidence));
+    (kept, values.flat_map(|value| value.to_le_bytes()).collect())
+}
+
+fn unpack(kept: &Kept, bytes: &[u8]) -> Seen {
+    let grid = Grid { width: kept.width, height: kept.height, scale: kept.scale };
+    let values: Vec<f32> = bytes.as_chunks::<4>().0.iter().map(|four| f32::from_le_bytes(*four)).collect();
+    let mut rest = values.chunks_exact(3 * grid.cells());
+    std::array::from_fn(|rung| {
+        let step = |(blind, level): &(bool, Option<f32>)| {
+            let (vectors, confidence) = rest.next().map_or((&[][..], &[][..]), |step| step.split_at(2 * grid.cells()));
+            Step {
+                blind: *blind,
+                noise_level: level.unwrap_or(f32::NAN),
+                grid,
+                vectors: vectors.to_vec(),
+                confidence: confidence.to_vec(),
+            }
+        };
+        kept.steps[rung].iter().map(step).collect()
+    })
+}
+
+/// A head in JSON with its length before it, then bytes; `None` where there is no such file.
+fn read<H: DeserializeOwned>(path: &Path) -> Option<(H, Vec<u8>)> {
+    let mut file = fs::File::open(path).ok()?;
+    let mut length = [0; 8];
+    file.read_exact(&mut length).ok()?;
+    let mut head = vec![0; u64::from_le_bytes(length) as usize];
+    file.read_exact(&mut head).ok()?;
+    let mut bytes = Vec::new();
+    file.read_to_end(&mut bytes).ok()?;
+    Some((serde_json::from_slice(&head).ok()?, bytes))
+}
+
+/// Written beside its place and moved there whole, so that a run that is cut off leaves nothing torn.
+fn write<H: Serialize>(path: &Path, head: &H, bytes: &[u8]) -> Result<(), String> {
+    let head = serde_json::to_vec(head).map_err(|error| error.to_string())?;
+    let beside = path.with_extension("part");
+    let whole = || -> std::io::Result<()> {
+        let mut file = fs::File::create(&beside)?;
+        file.write_all(&(head.len() as u64).to_le_bytes())?;
+        file.write_all(&head)?;
+        file.write_all(bytes)?;
+        fs::rename(&beside, path)
+    };
+    whole().map_err(|error| format!("{}: {error}", path.display()))
+}
