@@ -110,6 +110,7 @@ impl Pipeline {
             State::Blind(_) => Err(Lack::Blind),
             _ => self.motion.velocity(&flow, camera_size),
         };
+        let integrated = self.motion.integrated(&flow, camera_size, matches!(state, State::Blind(_)));
         laps.lap(Stage::Motion);
         let moved = Moved {
             step: self.steps,
@@ -126,6 +127,7 @@ impl Pipeline {
             confidence,
             state,
             velocity,
+            integrated,
         };
         self.steps += 1;
         Ok(Outcome::Moved(moved))

@@ -7,15 +7,15 @@ use rand_chacha::ChaCha8Rng;
 use super::{Config, Lack};
 
 /// Where Tukey's weight ends, in standard deviations: 95 % efficient on Gaussian noise.
-const CUT: f64 = 4.685;
+pub(super) const CUT: f64 = 4.685;
 const ROUNDS: usize = 10;
 const GUESSES: usize = 64;
 /// Vectors that a guess is scored on.
 const JURY: usize = 240;
 /// Median length of a two-dimensional standard normal vector.
-const MEDIAN_LENGTH: f64 = 1.177_410_022_515_474_7;
+pub(super) const MEDIAN_LENGTH: f64 = 1.177_410_022_515_474_7;
 /// The least spread in radians: a twentieth of a pixel, below which quantisation speaks.
-const SPREAD_MIN: f64 = 5e-5;
+pub(super) const SPREAD_MIN: f64 = 5e-5;
 
 /// One flow vector with its turn taken off.
 #[derive(Debug, Clone, Copy, Default)]

@@ -10,11 +10,13 @@ mod config;
 mod fit;
 mod ground;
 mod gyro;
+mod integrated;
 mod lens;
 mod odometer;
 mod quality;
 
 pub use config::{AttitudeUse, Config, GyroUse, Mount, REASONS};
+pub use integrated::{Integrated, NoFlow};
 pub use odometer::Odometer;
 pub use quality::{BOUND_M_S, BOUND_PART, BOUND_PER_S};
 

@@ -7,6 +7,7 @@ use super::{
     fit::{Fit, Found, Sight},
     ground::Ranges,
     gyro::{Rates, Turn},
+    integrated::Below,
     lens::Lens,
     quality,
 };
@@ -21,29 +22,30 @@ const UNOBSERVED: f64 = 1e6;
 /// Velocity from flow over the ground. It allocates nothing after its first step.
 #[derive(Debug)]
 pub struct Odometer {
-    config: Config,
+    pub(super) config: Config,
     /// Brings optical axes to body axes.
-    mount: Rotation3<f64>,
+    pub(super) mount: Rotation3<f64>,
     beam: Vector3<f64>,
-    lens: Option<Lens>,
+    pub(super) lens: Option<Lens>,
     /// Rays of the raster's cells, row by row, and the raster that they belong to: they change with the calibration only.
     rays: Vec<Option<[f64; 2]>>,
     rays_of: Option<Grid>,
-    rates: Rates,
+    pub(super) rates: Rates,
     ranges: Ranges,
     fit: Fit,
+    pub(super) below: Below,
 }
 
 /// The ground as seen from the older frame.
-struct Ground {
+pub(super) struct Ground {
     /// Unit vector to the ground, body axes.
-    normal: Vector3<f64>,
+    pub(super) normal: Vector3<f64>,
     tilt_sd: f64,
-    distance: Result<Distance, NoDistance>,
+    pub(super) distance: Result<Distance, NoDistance>,
 }
 
-struct Distance {
-    metres: f64,
+pub(super) struct Distance {
+    pub(super) metres: f64,
     sd: f64,
     /// The point that the beam hit, from the camera, body axes: how a tilt's error changes the distance.
     hit: Vector3<f64>,
@@ -81,6 +83,7 @@ impl Odometer {
             rates: Rates::new(imu),
             ranges: Ranges::new(),
             fit: Fit::default(),
+            below: Below::default(),
         })
     }
 
@@ -143,7 +146,7 @@ impl Odometer {
         }
     }
 
-    fn ground(&self, flow: &Flow<'_>) -> Ground {
+    pub(super) fn ground(&self, flow: &Flow<'_>) -> Ground {
         let config = &self.config;
         let stated = match config.attitude {
             AttitudeUse::Imu => self.rates.up_at(flow.older, config.range_age_s_max),

@@ -278,7 +278,12 @@ mod tests {
     use std::sync::mpsc;
 
     use super::*;
-    use crate::{exposure::Exposed, flow, publish::Moved};
+    use crate::{
+        exposure::Exposed,
+        flow,
+        motion::{Integrated, Lack, NoFlow},
+        publish::Moved,
+    };
 
     #[test]
     fn images_keep_the_pace_of_the_stamps() {
@@ -342,7 +347,8 @@ mod tests {
             saturated_part: 0.0,
             confidence: 0.0,
             state: flow::State::Ok,
-            velocity: Err(crate::motion::Lack::Gyro),
+            velocity: Err(Lack::Gyro),
+            integrated: Integrated::without(Stamp::from_ns(0), Stamp::from_ns(1), NoFlow::Blind),
         }
     }
 }

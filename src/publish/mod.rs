@@ -1,5 +1,6 @@
-//! Stage 5: flow and velocity go out, to this machine's memory, to ROS 2 and to zenoh.
+//! Stage 5: flow and velocity go out, to this machine's memory, to ROS 2, to zenoh and to an autopilot.
 
+pub mod autopilot;
 pub mod courier;
 pub mod iceoryx2;
 pub mod outgoing;
@@ -12,6 +13,8 @@ pub mod zenoh;
 
 use serde::{Deserialize, Serialize};
 
+pub use autopilot::{Mavlink, Px4};
+
 /// `[publish.zenoh]`: the same settings as for a camera.
 pub use crate::camera::Zenoh;
 
@@ -19,7 +22,7 @@ use crate::{
     camera::Sample,
     clock::Stamp,
     flow::{Flow, State},
-    motion::{Lack, Velocity},
+    motion::{Integrated, Lack, Velocity},
     wire,
 };
 
@@ -54,6 +57,8 @@ pub struct Moved {
     pub state: State,
     /// The velocity, or what it lacks.
     pub velocity: Result<Velocity, Lack>,
+    /// The flow straight below in an autopilot's form.
+    pub integrated: Integrated,
 }
 
 /// One step as a sink sees it.
@@ -163,6 +168,10 @@ pub struct Config {
     pub ros2: Option<Ros2>,
     /// zenoh.
     pub zenoh: Option<Zenoh>,
+    /// An autopilot over MAVLink.
+    pub mavlink: Option<Mavlink>,
+    /// PX4's own topics over DDS.
+    pub px4: Option<Px4>,
     /// Topics stand under this name.
     pub namespace: String,
     /// Frame of reference of the published velocity (FLU).
@@ -177,6 +186,8 @@ impl Default for Config {
             iceoryx2: Some(Iceoryx2::default()),
             ros2: None,
             zenoh: None,
+            mavlink: None,
+            px4: None,
             namespace: "/nightflow".into(),
             body_frame: "base_link".into(),
             image_hz_max: 2.0,
@@ -197,6 +208,23 @@ pub const REASONS: &[(&str, &str)] = &[
     ("zenoh.listen", "none: a free port of this machine only, as rmw_zenoh's nodes do"),
     ("zenoh.rmw", "true: the readers are ROS 2 nodes with rmw_zenoh; false for plain zenoh programs"),
     ("zenoh.domain", "0: what ROS_DOMAIN_ID is where nobody set it"),
+    ("mavlink.autopilot", "px4: it takes the flow with the gyro of the very same interval"),
+    ("mavlink.words", "flow: an autopilot that is told the velocity too would fuse the same light twice"),
+    ("mavlink.system", "1: the vehicle's own number unless there are several"),
+    ("mavlink.component", "197: what MAVLink calls a camera's odometry"),
+    ("mavlink.sensor", "0: the first, and there is only one"),
+    ("mavlink.hz", "0: every step, as long as the line has room for it"),
+    (
+        "mavlink.time_offset_us",
+        "0: stamps are the camera's, and TIMESYNC tells the autopilot how its clock stands to them",
+    ),
+    ("mavlink.link", "where PX4's simulator listens for a companion; on a vehicle it is mostly a serial line"),
+    ("px4.domain", "0: what the agent joins where nobody told it otherwise"),
+    ("px4.namespace", "none: PX4 has none where it flies alone"),
+    ("px4.topics", "sensor_optical_flow: PX4 as it is built reads it, and keeps our stamps"),
+    ("px4.device_id", "any number that stays the same: what counts is that it is not 0"),
+    ("px4.hz", "0: every step; PX4 joins what is too fast for it"),
+    ("px4.time_offset_us", "0: the agent's machine is this one, and the agent tells PX4 its clock"),
 ];
 
 /// `[publish.iceoryx2]`.
@@ -233,7 +261,13 @@ mod tests {
 
     #[test]
     fn every_key_of_every_sink_has_a_reason_and_no_reason_is_left_over() {
-        let all = Config { ros2: Some(Ros2::default()), zenoh: Some(Zenoh::default()), ..Config::default() };
+        let all = Config {
+            ros2: Some(Ros2::default()),
+            zenoh: Some(Zenoh::default()),
+            mavlink: Some(Mavlink::default()),
+            px4: Some(Px4::default()),
+            ..Config::default()
+        };
         let mut keys = BTreeSet::new();
         for (key, value) in toml::Table::try_from(all).unwrap() {
             match value {

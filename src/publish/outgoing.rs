@@ -244,7 +244,7 @@ mod tests {
     use crate::{
         exposure::Exposed,
         flow::Cause,
-        motion::{Lack, NoDistance},
+        motion::{Integrated, Lack, NoDistance, NoFlow},
     };
 
     fn moved(state: State, scale: Scale) -> Moved {
@@ -274,6 +274,7 @@ mod tests {
                 inliers: 400,
                 quality: 200,
             }),
+            integrated: Integrated::without(older, newer, NoFlow::Blind),
         }
     }
 

@@ -19,7 +19,7 @@ use crate::{
 
 const NAME: &str = "ros2";
 /// Only discovery and acknowledgements come in here.
-const ACK_BUFFER: usize = 1 << 20;
+pub(super) const ACK_BUFFER: usize = 1 << 20;
 /// What a reliable reader may miss and still be sent again.
 const DEPTH: usize = 10;
 
@@ -90,7 +90,7 @@ impl Drop for Dds {
     }
 }
 
-fn publisher<M: wire::Message>(node: &mut Node, name: &str) -> Result<Publisher<M>, String> {
+pub(super) fn publisher<M: wire::Message>(node: &mut Node, name: &str) -> Result<Publisher<M>, String> {
     let qos = QosProfile::publisher_default()
         .reliability_reliable(WhenFull::DEFAULT)
         .history(History::KeepLast { depth: DEPTH });
@@ -98,6 +98,6 @@ fn publisher<M: wire::Message>(node: &mut Node, name: &str) -> Result<Publisher<
     node.create_publisher(&topic, Some(qos)).map_err(|e| format!("{name}: {e}"))
 }
 
-fn publish<M: wire::Message + Clone>(publisher: &Publisher<M>, message: &M) -> Result<(), String> {
+pub(super) fn publish<M: wire::Message + Clone>(publisher: &Publisher<M>, message: &M) -> Result<(), String> {
     publisher.publish(message.clone()).map_err(|why| format!("{}: {why}", wire::ros_name::<M>()))
 }

@@ -7,6 +7,7 @@ mod diagnostic;
 mod encoder;
 mod geometry;
 mod nightflow;
+mod px4;
 pub mod rmw;
 mod sensor;
 mod standard;
@@ -19,6 +20,7 @@ pub use geometry::{
     Quaternion, Twist, TwistStamped, TwistWithCovariance, TwistWithCovarianceStamped, Vector3, Vector3Stamped,
 };
 pub use nightflow::{EgoMotion, Status, Step};
+pub use px4::{ObstacleDistance, SensorOpticalFlow, VehicleOpticalFlow};
 pub use sensor::{CameraInfo, CompressedImage, Image, Imu, LaserScan, Range, RegionOfInterest};
 pub use standard::{Header, Time};
 
@@ -136,8 +138,9 @@ macro_rules! texts {
     };
 }
 
-const TEXTS: [(&str, &str); 22] = texts! {
+const TEXTS: [(&str, &str); 25] = texts! {
     "" "nightflow_msgs": "EgoMotion" "Status" "Step";
+    "px4_msgs/" "px4_msgs": "ObstacleDistance" "SensorOpticalFlow" "VehicleOpticalFlow";
     "standard/builtin_interfaces/" "builtin_interfaces": "Time";
     "standard/diagnostic_msgs/" "diagnostic_msgs": "DiagnosticArray" "DiagnosticStatus" "KeyValue";
     "standard/geometry_msgs/" "geometry_msgs": "Quaternion" "Twist" "TwistStamped" "TwistWithCovariance"

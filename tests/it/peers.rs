@@ -89,6 +89,11 @@ impl Peer {
         }
     }
 
+    /// The next line, or none in this time.
+    pub fn line_within(&mut self, within: Duration) -> Option<String> {
+        self.lines.recv_timeout(within).ok()
+    }
+
     /// The next line that begins so, passing over others; fails the test when none comes in time.
     pub fn line_starting(&mut self, start: &str, within: Duration) -> String {
         let until = Instant::now() + within;

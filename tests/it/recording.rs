@@ -10,7 +10,7 @@ use nightflow::{
     clock::Stamp,
     exposure::Exposed,
     flow::{Cause, Flow, Grid, State},
-    motion::{Lack, Scale, Velocity},
+    motion::{Integrated, Lack, NoFlow, Scale, Velocity},
     publish::{Moved, Offer, Sink},
     recording::{self, Compression, Config, Output, Outputs, Recorder, Writer, check},
     wire::{CameraInfo, Header, Image, Imu, Range, Status, Vector3},
@@ -99,6 +99,7 @@ pub fn moved(step: u64, state: State) -> Moved {
         confidence: 0.75,
         state,
         velocity,
+        integrated: Integrated::without(older, newer, NoFlow::Blind),
     }
 }
 

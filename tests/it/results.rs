@@ -9,7 +9,7 @@ use nightflow::{
     clock::Stamp,
     exposure::Exposed,
     flow::{Cause, Flow, Grid, State},
-    motion::{NoDistance, Scale, Velocity},
+    motion::{Integrated, NoDistance, NoFlow, Scale, Velocity},
     publish::{Config, Moved, Offer, Sink},
     wire::{Header, Status},
 };
@@ -94,6 +94,7 @@ fn moved(step: u64) -> Moved {
         confidence: 0.75,
         state,
         velocity: Ok(velocity),
+        integrated: Integrated::without(older, newer, NoFlow::Blind),
     }
 }
 

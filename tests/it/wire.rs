@@ -6,8 +6,9 @@ use std::{collections::BTreeSet, path::Path, time::Duration};
 
 use nightflow::wire::{
     self, CameraInfo, CompressedImage, Definitions, DiagnosticArray, DiagnosticStatus, EgoMotion, Header, Image, Imu,
-    KeyValue, LaserScan, Message, Quaternion, Range, RegionOfInterest, Status, Step, Time, Twist, TwistStamped,
-    TwistWithCovariance, TwistWithCovarianceStamped, Vector3, Vector3Stamped,
+    KeyValue, LaserScan, Message, ObstacleDistance, Quaternion, Range, RegionOfInterest, SensorOpticalFlow, Status,
+    Step, Time, Twist, TwistStamped, TwistWithCovariance, TwistWithCovarianceStamped, Vector3, Vector3Stamped,
+    VehicleOpticalFlow,
     definition::{Base, Count, Definition},
 };
 use proptest::{prelude::*, strategy::ValueTree, test_runner::TestRunner};
@@ -21,7 +22,8 @@ macro_rules! for_every_message {
         for_every_message!(@each $check ($($argument),*)
             Time, Header, Image, CompressedImage, CameraInfo, RegionOfInterest, Imu, Range, LaserScan, Vector3,
             Vector3Stamped, Quaternion, Twist, TwistStamped, TwistWithCovariance, TwistWithCovarianceStamped, KeyValue,
-            DiagnosticStatus, DiagnosticArray, Step, EgoMotion, Status)
+            DiagnosticStatus, DiagnosticArray, Step, EgoMotion, Status, SensorOpticalFlow, VehicleOpticalFlow,
+            ObstacleDistance)
     };
     (@each $check:ident $arguments:tt $($message:ty),*) => { $(for_every_message!(@one $check $arguments $message);)* };
     (@one $check:ident ($($argument:expr),*) $message:ty) => { $check::<$message>($($argument),*) };
@@ -45,6 +47,7 @@ fn every_msg_file_is_built_in_and_every_struct_has_one() {
         }
     };
     take("nightflow_msgs", &root.join("msg"));
+    take("px4_msgs", &root.join("px4_msgs/msg"));
     for package in std::fs::read_dir(root.join("standard")).unwrap() {
         let package = package.unwrap();
         take(package.file_name().to_str().unwrap(), &package.path().join("msg"));

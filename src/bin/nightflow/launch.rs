@@ -39,7 +39,9 @@ pub fn settings(launch_file: Option<&Path>, bag: &Path) -> Result<Config> {
         Some(text) => Config::parse(text, Path::new(&format!("in {}", bag.display())))?,
         None => Config::default(),
     };
-    (config.publish.iceoryx2, config.publish.ros2, config.publish.zenoh) = (None, None, None);
+    let publish = &mut config.publish;
+    (publish.iceoryx2, publish.ros2, publish.zenoh) = (None, None, None);
+    (publish.mavlink, publish.px4) = (None, None);
     Ok(config)
 }
 
@@ -124,6 +126,12 @@ fn network_sinks(config: &publish::Config, outputs: &mut Outputs) -> Result<()> 
     }
     if let Some(zenoh) = &config.zenoh {
         outputs.sinks.push(Box::new(publish::zenoh::open(config, zenoh)?));
+    }
+    if let Some(mavlink) = &config.mavlink {
+        outputs.sinks.push(Box::new(publish::autopilot::mavlink::open(mavlink)?));
+    }
+    if let Some(px4) = &config.px4 {
+        outputs.sinks.push(Box::new(publish::autopilot::px4::open(px4)?));
     }
     Ok(())
 }
