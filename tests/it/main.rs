@@ -12,6 +12,7 @@ mod flow;
 mod flow_files;
 mod iceoryx2;
 mod latest;
+mod launch_configs;
 mod live;
 mod motion;
 mod noise;
