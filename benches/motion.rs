@@ -1,4 +1,4 @@
-//! What a velocity costs: a flow raster of the network's quarter resolution and one of its whole size.
+//! What a velocity and an autopilot's flow cost: a flow raster of the network's quarter resolution and one of its whole size.
 
 use std::{f64::consts::TAU, hint::black_box};
 
@@ -43,16 +43,23 @@ fn velocity(criterion: &mut Criterion) {
     ] {
         let mut odometer = odometer();
         let mut draws = Normals::new(1, 0);
-        // A third of the vectors is wrong, so that the fit has its usual work.
-        let wrong = |i: usize| if (i / 2).is_multiple_of(3) { 15.0 } else { 0.5 };
-        let vectors: Vec<f32> =
-            (0..2 * grid.cells()).map(|i| (5.0 * (i % 2) as f64 + wrong(i) * draws.draw()) as f32).collect();
+        // A third of the vectors is wrong, so that the fit has its usual work; no raster meets only those.
+        let vectors: Vec<f32> = (0..grid.cells())
+            .flat_map(|_| {
+                let noise = if draws.uniform() < 1.0 / 3.0 { 15.0 } else { 0.5 };
+                [noise * draws.draw(), 5.0 + noise * draws.draw()].map(|pixels| pixels as f32)
+            })
+            .collect();
         let confidence = vec![0.8; grid.cells()];
         let (older, newer) = (Stamp(1_000_000_000), Stamp(NEWER_NS));
         let flow = Flow { older, newer, grid, vectors: &vectors, confidence: &confidence };
         assert!(odometer.velocity(&flow, [640, 480]).is_ok());
         criterion.bench_function(name, |bencher| {
             bencher.iter(|| black_box(odometer.velocity(black_box(&flow), [640, 480])));
+        });
+        assert!(odometer.integrated(&flow, [640, 480], false).flow.is_ok());
+        criterion.bench_function(&name.replace("velocity", "flow straight below"), |bencher| {
+            bencher.iter(|| black_box(odometer.integrated(black_box(&flow), [640, 480], false)));
         });
     }
 }

@@ -19,7 +19,7 @@ use crate::{
 /// The most vectors that are looked at: neighbours are alike, and the two angles need no more.
 const PAIRS_MAX: usize = 600;
 /// Rounds that weigh by the inverse of the residual, which no start can lead astray, and then Tukey's.
-const ROUNDS: [usize; 2] = [6, 5];
+const ROUNDS: [usize; 2] = [4, 3];
 
 /// What an autopilot's optical flow message holds, for one step. Body axes FRD (x forward, y right, z down).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -237,19 +237,20 @@ impl Below {
 
     /// One round of weighted least squares over x₂(h₆x + h₇y + 1) = h₀x + h₁y + h₂, and the same in y.
     fn weigh(&self, factor: impl Fn(&Pair) -> f64) -> Option<Matrix3<f64>> {
-        let [mut plain, mut by_x, mut by_y, mut by_both] = [Matrix3::zeros(); 4];
+        // Upper triangles of the rays' squares: xx, xy, x, yy, y, 1; plain, and times x₂, y₂ and x₂² + y₂².
+        let mut sums = [[0.0; 6]; 4];
         for pair in &self.pairs {
             let weight = pair.weight * factor(pair);
-            if weight <= 0.0 {
-                continue;
+            let ([x, y], [x2, y2]) = (pair.from, pair.to);
+            let square = [x * x, x * y, x, y * y, y, 1.0];
+            for (sum, by) in sums.iter_mut().zip([weight, weight * x2, weight * y2, weight * (x2 * x2 + y2 * y2)]) {
+                for (one, part) in sum.iter_mut().zip(square) {
+                    *one += by * part;
+                }
             }
-            let ([x, y], ray) = (pair.to, Vector3::new(pair.from[0], pair.from[1], 1.0));
-            let square = ray * ray.transpose() * weight;
-            plain += square;
-            by_x += square * x;
-            by_y += square * y;
-            by_both += square * (x * x + y * y);
         }
+        let [plain, by_x, by_y, by_both] =
+            sums.map(|[xx, xy, x, yy, y, one]| Matrix3::new(xx, xy, x, xy, yy, y, x, y, one));
         let mut normal = SMatrix::<f64, 8, 8>::zeros();
         normal.fixed_view_mut::<3, 3>(0, 0).copy_from(&plain);
         normal.fixed_view_mut::<3, 3>(3, 3).copy_from(&plain);
