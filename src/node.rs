@@ -11,7 +11,7 @@ use crate::{
     clock::{self, Laps, Reservoir, Stage, Stopwatch},
     exposure::Noise,
     flow::{Flow, Lender, Own, State},
-    motion::Scale,
+    motion::{Diagnosis, Scale},
     pipeline::{Outcome, Pipeline},
     publish::{self, Moved, Offer, Sink, iceoryx2::SharedSink},
     wire,
@@ -134,6 +134,8 @@ pub struct Report {
     pub speeds: Reservoir,
     /// State of the newest step.
     pub state: State,
+    /// What camera and gyro disagree on.
+    pub diagnosis: Option<Diagnosis>,
     /// Of the newest step: the camera's noise, the raw mean, and the noise level in the network's image.
     pub noise: Option<(Noise, f32, f32)>,
 }
@@ -181,6 +183,11 @@ impl Report {
             State::Ok => (0, String::new()),
             State::Degraded(cause) => (1, cause.to_string()),
             State::Blind(cause) => (2, cause.to_string()),
+        };
+        let (state, cause) = match &self.diagnosis {
+            Some(diagnosis) if cause.is_empty() => (state.max(1), diagnosis.to_string()),
+            Some(diagnosis) => (state, format!("{cause}; {diagnosis}")),
+            None => (state, cause),
         };
         let [noise_a, noise_b, snr_db, noise_level] = self.noise.map_or([f32::NAN; 4], |(noise, mean, level)| {
             [noise.a as f32, noise.b as f32, noise.snr_db(mean.into()) as f32, level]
@@ -307,6 +314,7 @@ pub fn drive(
         report.source = source.counts();
         if cadence.last.elapsed() >= STATUS {
             report.lost = outputs.lost();
+            report.diagnosis = pipeline.as_deref().and_then(Pipeline::diagnosis);
             outputs.status(&report.status(&cadence));
             cadence = Cadence { last: clock::instant(), steps: report.steps, ..cadence };
         }

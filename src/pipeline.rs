@@ -7,8 +7,8 @@ use crate::{
     clock::{Laps, Stage, Stamp},
     config::Config,
     exposure::{self, Developer, Exposed},
-    flow::{self, Lender, Matcher, State},
-    motion::{self, Lack, Odometer},
+    flow::{self, Lender, Matcher, Resolution, State},
+    motion::{self, Diagnosis, Lack, Odometer},
     publish::Moved,
 };
 
@@ -77,10 +77,16 @@ impl Pipeline {
 
     /// The same with a network that is already open.
     pub fn with(config: &Config, flow: Matcher) -> Result<Self, Error> {
+        let mut motion = config.motion.clone();
+        // A cell at full resolution is a quarter of the cell that the setting is about.
+        motion.flow_shared_sd_cells *= match config.flow.resolution {
+            Resolution::Quarter => 1.0,
+            Resolution::Full => 4.0,
+        };
         Ok(Self {
             exposure: Developer::new(&config.exposure)?,
             flow,
-            motion: Odometer::new(&config.motion)?,
+            motion: Odometer::new(&motion)?.exposing(config.camera.exposure_s),
             gap_ms_max: config.flow.gap_ms_max,
             newest: None,
             steps: 0,
@@ -150,6 +156,11 @@ impl Pipeline {
     /// The newest developed frame, for previews.
     pub fn image(&self) -> Option<&Exposed> {
         self.exposure.newest()
+    }
+
+    /// What camera and gyro disagree on, if they do beyond doubt.
+    pub fn diagnosis(&self) -> Option<Diagnosis> {
+        self.motion.diagnosis()
     }
 
     /// The network that runs.

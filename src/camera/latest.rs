@@ -20,7 +20,7 @@ pub fn mailbox(room: usize) -> (Sender, Latest) {
     let room = room.max(1);
     let inside = Inside { small: VecDeque::with_capacity(room), room, senders: 1, ..Inside::default() };
     let shared = Arc::new(Shared { inside: Mutex::new(inside), came: Condvar::new() });
-    (Sender { shared: shared.clone() }, Latest { shared })
+    (Sender { shared: shared.clone() }, Latest { shared, lead_ns: 0 })
 }
 
 /// Where a transport's thread puts what arrives. The source ends when the last sender is dropped.
@@ -31,6 +31,8 @@ pub struct Sender {
 /// Where the node takes samples from.
 pub struct Latest {
     shared: Arc<Shared>,
+    /// How much newer than its frame a small sample may be and come before it.
+    lead_ns: i64,
 }
 
 struct Shared {
@@ -150,6 +152,13 @@ impl Drop for Sender {
 }
 
 impl Latest {
+    /// For frames whose stamps are the beginnings of exposures of this length: small samples up to the middle of the
+    /// exposure come before the frame, which cannot have arrived before them.
+    pub fn exposing(mut self, exposure_s: f64) -> Latest {
+        self.lead_ns = (0.5e9 * exposure_s).round() as i64;
+        self
+    }
+
     /// The next sample: small ones as old as the waiting frame or older in the order of their stamps, then the frame.
     /// Small samples newer than that wait for the next frame, but for no longer than `wait`.
     pub fn next(&mut self, wait: Duration) -> Result<Next, Error> {
@@ -162,7 +171,7 @@ impl Latest {
         if !inside.ready() {
             inside.overdue = inside.small.len();
         }
-        if let Some(sample) = inside.take() {
+        if let Some(sample) = inside.take(self.lead_ns) {
             return Ok(Next::Sample(sample));
         }
         match inside.failure.take() {
@@ -194,9 +203,9 @@ impl Inside {
         self.senders == 0 || self.failure.is_some()
     }
 
-    fn take(&mut self) -> Option<Sample> {
+    fn take(&mut self, lead_ns: i64) -> Option<Sample> {
         let due = match &self.frame {
-            Some(frame) => frame.stamp(),
+            Some(frame) => Stamp(frame.stamp().ns().saturating_add(lead_ns)),
             None if self.overdue > 0 || self.ended() => Stamp::from_ns(i64::MAX),
             None => return None,
         };

@@ -29,7 +29,7 @@ const PAUSE_MAX: Duration = Duration::from_secs(5);
 /// Opens the recording as it is asked for: every frame, or at its own pace with only the newest.
 pub fn open(config: &Config, mcap: &Mcap) -> Result<Box<dyn Source>, Error> {
     let recording = Recording::open(&mcap.path, config)?;
-    Ok(if mcap.realtime { Box::new(Paced::start(recording)?) } else { Box::new(recording) })
+    Ok(if mcap.realtime { Box::new(Paced::start(recording, config.exposure_s)?) } else { Box::new(recording) })
 }
 
 /// What a topic is read as.
@@ -249,8 +249,9 @@ pub struct Paced {
 }
 
 impl Paced {
-    fn start(recording: Recording) -> Result<Self, Error> {
+    fn start(recording: Recording, exposure_s: f64) -> Result<Self, Error> {
         let (sender, latest) = latest::mailbox(SMALL_ROOM);
+        let latest = latest.exposing(exposure_s);
         let (stop, progress) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
         let name = recording.path.display().to_string();
         let playing = {

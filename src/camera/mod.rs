@@ -136,6 +136,8 @@ pub struct Config {
     pub range_topic: String,
     /// A source is called lost after this time without a frame.
     pub silence_s_max: f64,
+    /// How long an exposure lasts that begins at its frame's stamp.
+    pub exposure_s: f64,
 }
 
 impl Config {
@@ -155,6 +157,7 @@ impl Default for Config {
             imu_topic: "/imu/data_raw".into(),
             range_topic: "/range".into(),
             silence_s_max: 1.0,
+            exposure_s: 0.0,
         }
     }
 }
@@ -166,6 +169,10 @@ pub const REASONS: &[(&str, &str)] = &[
     ("imu_topic", "REP 145: what the sensor measured, with no orientation mixed in"),
     ("range_topic", "no convention exists; set it to the range finder's"),
     ("silence_s_max", "1: thirty frames of a 30 Hz camera, and soon enough for a pilot"),
+    (
+        "exposure_s",
+        "0: no message tells it; gyro and range are looked at in the middle of the exposure, which is the stamp without it",
+    ),
     ("source.ros2.domain", "0: what ROS_DOMAIN_ID is where nobody set it"),
     ("source.ros2.reliable", "false: a frame that has to be sent again comes too late"),
     (

@@ -69,7 +69,7 @@ impl Ros2Source {
             .name("camera-ros2".into())
             .spawn(move || on_tokio(receive(node, readers, sender, stopped)))
             .map_err(|e| lost(e.to_string()))?;
-        Ok(Self { latest, stop: Some(stop), thread: Some(thread) })
+        Ok(Self { latest: latest.exposing(config.exposure_s), stop: Some(stop), thread: Some(thread) })
     }
 }
 

@@ -33,6 +33,7 @@ impl ZenohSource {
     pub fn open(config: &Config, settings: &Zenoh) -> Result<Self, Error> {
         let session = session(&settings.connect, &settings.listen).map_err(lost)?;
         let (sender, latest) = mailbox(SMALL_ROOM);
+        let latest = latest.exposing(config.exposure_s);
         let mut opening = Opening::new(&session, settings, sender).map_err(lost)?;
         opening
             .subscribe(&config.image_topic, |image| Sample::Frame(Arc::new(Frame { image, received: clock::now() })))?;

@@ -38,6 +38,8 @@ pub struct Config {
     pub attitude_sd_rad: f64,
     /// Error of taking the body's up for the ground's normal.
     pub level_sd_rad: f64,
+    /// How far the body's up may be off the ground's normal where the flow shows the normal.
+    pub lean_sd_rad: f64,
     /// A range older than this at the newer frame gives no distance.
     pub range_age_s_max: f64,
     /// Constant part of the range's noise, where its message states none.
@@ -62,10 +64,14 @@ pub struct Config {
     pub seed_rad: f64,
     /// No vector agrees that is further off than this angle.
     pub agree_rad_max: f64,
-    /// Flow error that all vectors of a step share, in widths of the frame.
-    pub flow_shared_sd_widths: f64,
+    /// Flow error that all vectors of a step share, in cells of a raster of a quarter of the network's resolution.
+    pub flow_shared_sd_cells: f64,
     /// Flow error that all vectors of a step share, as a part of their length.
     pub flow_shared_sd_part: f64,
+    /// Clocks of gyro and camera that are further apart than this are said to be so.
+    pub clock_offset_s_max: f64,
+    /// A flow that turns further or less far than the gyro by more than this part is said to do so.
+    pub turn_scale_off_max: f64,
     /// Seed of the random draws.
     pub seed: u32,
 }
@@ -100,6 +106,8 @@ pub enum AttitudeUse {
     Imu,
     /// Always the body's up.
     Level,
+    /// Nobody knows it: the flow itself shows it (a homography's normal), held to the body's up by `lean_sd_rad`.
+    Fit,
 }
 
 impl Default for Config {
@@ -121,6 +129,7 @@ impl Default for Config {
             stamp_jitter_sd_s: 1e-4,
             attitude_sd_rad: 0.01,
             level_sd_rad: 0.05,
+            lean_sd_rad: 0.2,
             range_age_s_max: 0.2,
             range_sd_m: 0.02,
             range_sd_part: 0.01,
@@ -133,8 +142,10 @@ impl Default for Config {
             inlier_part_min: 0.25,
             seed_rad: 0.004,
             agree_rad_max: 0.015,
-            flow_shared_sd_widths: 1.5e-4,
+            flow_shared_sd_cells: 0.012,
             flow_shared_sd_part: 0.005,
+            clock_offset_s_max: 0.002,
+            turn_scale_off_max: 0.02,
             seed: 1,
         }
     }
@@ -158,6 +169,7 @@ pub const REASONS: &[(&str, &str)] = &[
     ("stamp_jitter_sd_s", "a stamp taken in the driver's interrupt"),
     ("attitude_sd_rad", "0.6° is what a small AHRS holds"),
     ("level_sd_rad", "3°: a multicopter at low speed and ground that is nearly level"),
+    ("lean_sd_rad", "11°: a multicopter in wind, or a slope; a slow flight shows no normal, and this is all there is"),
     ("range_age_s_max", "four periods of a 20 Hz range finder"),
     ("range_sd_m", "time-of-flight sensors state 2 cm near by"),
     ("range_sd_part", "and 1 % further away"),
@@ -174,9 +186,11 @@ pub const REASONS: &[(&str, &str)] = &[
     ("seed_rad", "one and a half pixels of the network's image at its usual field of view"),
     ("agree_rad_max", "beyond six such pixels nothing is noise, whatever the spread of the rest"),
     (
-        "flow_shared_sd_widths",
-        "0.05 of the network's 320 pixels: what residuals can't show, for the fit takes it for motion (benches/velocity)",
+        "flow_shared_sd_cells",
+        "0.05 network pixels: what residuals can't show, for the fit takes it for motion (cargo bench --bench velocity)",
     ),
     ("flow_shared_sd_part", "the same bench, where the displacement is long"),
+    ("clock_offset_s_max", "at 1 rad/s² it turns 2 mrad/s that nobody made; twice what gyro_offset_sd_s counts with"),
+    ("turn_scale_off_max", "2 %: a focal length that is off by as much makes the velocity so too"),
     ("seed", "any number: what counts is that it stays the same"),
 ];

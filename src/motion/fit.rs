@@ -1,15 +1,23 @@
-//! The robust fit of the displacement over distance, τ, to the flow vectors of one step.
+//! The robust fit of the displacement over distance, τ, to the flow vectors of one step; of the ground's normal too
+//! where nobody knows it.
 
-use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix3x2, Vector2, Vector3};
+use nalgebra::{Matrix2x3, Matrix3, Matrix5, Matrix5x2, Matrix5x3, SMatrix, SVector, Vector2, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::{Config, Lack};
+use super::{
+    Config, Lack,
+    linear::{self, Leftover},
+};
 
 /// Where Tukey's weight ends, in standard deviations: 95 % efficient on Gaussian noise.
 pub(super) const CUT: f64 = 4.685;
 const ROUNDS: usize = 10;
 const GUESSES: usize = 64;
+/// Guesses where the normal has to be guessed too.
+const GUESSES_OF_NORMAL: usize = 256;
+/// Rounds in which the normal is fitted; unlike τ it is not linear.
+const ROUNDS_OF_NORMAL: usize = 20;
 /// Vectors that a guess is scored on.
 const JURY: usize = 240;
 /// Median length of a two-dimensional standard normal vector.
@@ -26,6 +34,8 @@ pub(super) struct Sight {
     pub(super) newer: [f64; 2],
     /// n·(x, y, 1): cosine to the ground's normal times the ray's length.
     pub(super) slope: f64,
+    /// The same for the two directions that the normal may lean to; 0 where the normal is given.
+    pub(super) lean: [f64; 2],
     /// Inverse variance by the confidence, relative.
     pub(super) weight: f64,
     /// Vectors that were left out keep their place in the raster.
@@ -36,40 +46,102 @@ pub(super) struct Sight {
     pub(super) agrees: bool,
 }
 
-impl Sight {
-    fn rows(&self) -> Matrix2x3<f64> {
-        let [x, y] = self.newer;
-        Matrix2x3::new(-1.0, 0.0, x, 0.0, -1.0, y) * self.slope
-    }
+/// What is looked for.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Motion {
+    /// Displacement of the camera over the distance to the ground.
+    pub(super) tau: Vector3<f64>,
+    /// How far the normal leans from the one that was given.
+    pub(super) lean: [f64; 2],
+}
 
-    fn motion(&self) -> Vector2<f64> {
-        Vector2::new(self.newer[0] - self.older[0], self.newer[1] - self.older[1])
-    }
-
-    fn off(&self, tau: &Vector3<f64>) -> [f64; 2] {
-        let [x, y] = self.newer;
-        [self.motion().x - self.slope * (-tau.x + x * tau.z), self.motion().y - self.slope * (-tau.y + y * tau.z)]
-    }
-
-    fn length(&self) -> f64 {
-        // Radians are far from overflow, and the root, unlike `hypot`, is exact to the bit on every machine.
-        (self.residual[0] * self.residual[0] + self.residual[1] * self.residual[1]).sqrt()
+impl Motion {
+    fn add<const D: usize>(&mut self, step: &SVector<f64, D>) {
+        for (axis, value) in step.iter().enumerate() {
+            match axis {
+                0..3 => self.tau[axis] += value,
+                _ => self.lean[axis - 3] += value,
+            }
+        }
     }
 }
 
-/// What the fit found, in the older frame's optical axes.
+impl Sight {
+    fn slope(&self, motion: &Motion) -> f64 {
+        self.slope + self.lean[0] * motion.lean[0] + self.lean[1] * motion.lean[1]
+    }
+
+    /// What the vector would be on a plane at distance 1 that is looked at squarely.
+    pub(super) fn per_slope(&self, tau: &Vector3<f64>) -> Vector2<f64> {
+        let [x, y] = self.newer;
+        Vector2::new(-tau.x + x * tau.z, -tau.y + y * tau.z)
+    }
+
+    /// Change of the vector with τ, and with the normal's lean where D is 5.
+    pub(super) fn rows<const D: usize>(&self, motion: &Motion) -> SMatrix<f64, 2, D> {
+        let ([x, y], slope) = (self.newer, self.slope(motion));
+        let off = self.per_slope(&motion.tau);
+        SMatrix::from_fn(|row, column| match (row, column) {
+            (0, 0) | (1, 1) => -slope,
+            (0, 2) => x * slope,
+            (1, 2) => y * slope,
+            (_, 3..) => off[row] * self.lean[column - 3],
+            _ => 0.0,
+        })
+    }
+
+    /// Change of the vector with an error of the turn that was taken off, optical axes.
+    pub(super) fn turned(&self) -> Matrix2x3<f64> {
+        let [x, y] = self.newer;
+        Matrix2x3::new(-x * y, 1.0 + x * x, -y, -(1.0 + y * y), x * y, x)
+    }
+
+    fn off(&self, motion: &Motion) -> [f64; 2] {
+        let (slope, by) = (self.slope(motion), self.per_slope(&motion.tau));
+        [self.newer[0] - self.older[0] - slope * by.x, self.newer[1] - self.older[1] - slope * by.y]
+    }
+
+    pub(super) fn length(&self) -> f64 {
+        // Radians are far from overflow, and the root, unlike `hypot`, is exact to the bit on every machine.
+        (self.residual[0] * self.residual[0] + self.residual[1] * self.residual[1]).sqrt()
+    }
+
+    /// Tukey's weight of the residual, 0…1.
+    pub(super) fn tukey(&self, spread: f64) -> f64 {
+        let part = self.weight * self.length().powi(2) / (CUT * spread).powi(2);
+        if part < 1.0 { (1.0 - part).powi(2) } else { 0.0 }
+    }
+
+    /// Derivative of the weighted residual by the residual.
+    pub(super) fn tukey_slope(&self, spread: f64) -> SMatrix<f64, 2, 2> {
+        let cut = (CUT * spread).powi(2);
+        let part = self.weight * self.length().powi(2) / cut;
+        if part >= 1.0 {
+            return SMatrix::zeros();
+        }
+        let residual = Vector2::from(self.residual);
+        let bend = residual * residual.transpose() * (4.0 * (1.0 - part) * self.weight / cut);
+        (SMatrix::identity() * (1.0 - part).powi(2) - bend) * self.weight
+    }
+}
+
+/// What the fit found, in the older frame's optical axes. Where the normal was given, what concerns its lean is 0.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Found {
     /// Displacement of the camera over the distance to the ground.
     pub(super) tau: Vector3<f64>,
-    /// Of `tau`, by the residuals.
-    pub(super) covariance: Matrix3<f64>,
-    /// Change of `tau` with an error of the turn that was taken off.
-    pub(super) by_turn: Matrix3<f64>,
-    /// Change of `tau` with a shift that all vectors share.
-    pub(super) by_shift: Matrix3x2<f64>,
-    /// Change of `tau` with an error of the normal.
+    /// How far the normal leans from the one that was given, before it is made a unit again.
+    pub(super) lean: [f64; 2],
+    /// Of `tau` and `lean`, by the residuals.
+    pub(super) covariance: Matrix5<f64>,
+    /// Change of both with an error of the turn that was taken off.
+    pub(super) by_turn: Matrix5x3<f64>,
+    /// Change of both with a shift that all vectors share.
+    pub(super) by_shift: Matrix5x2<f64>,
+    /// Change of `tau` with an error of the normal that was given.
     pub(super) by_normal: Matrix3<f64>,
+    /// The turn that is left in the vectors, where they tell it apart from the motion.
+    pub(super) leftover: Option<Leftover>,
     pub(super) samples: u32,
     pub(super) inliers: u32,
     /// Root mean square of the length of those that agree, as they were seen: what an error of the network's that grows
@@ -86,13 +158,14 @@ pub(super) struct Fit {
     pub(super) sights: Vec<Sight>,
     scratch: Vec<f64>,
     /// Residuals over their spread, place by place; NaN where none agrees.
-    scaled: Vec<[f64; 2]>,
+    pub(super) scaled: Vec<[f64; 2]>,
     offered: Vec<u32>,
 }
 
 impl Fit {
-    /// Fits τ to what stands in `sights`. The draws depend on `seed` alone.
-    pub(super) fn solve(&mut self, config: &Config, seed: u64) -> Result<Found, Lack> {
+    /// Fits τ to what stands in `sights`, and the normal's lean where it is not known better than `lean_sd`. The draws
+    /// depend on `seed` alone.
+    pub(super) fn solve(&mut self, config: &Config, lean_sd: Option<f64>, seed: u64) -> Result<Found, Lack> {
         self.offered.clear();
         self.offered.extend((0u32..).zip(&self.sights).filter(|(_, sight)| sight.offered).map(|(i, _)| i));
         let samples = self.offered.len() as u32;
@@ -100,55 +173,79 @@ impl Fit {
         if samples < needed.max(2) {
             return Err(Lack::Disagreement { inliers: samples, samples, needed: needed.max(2) });
         }
-        let mut tau = self.guess(config, seed).ok_or(Lack::Degenerate)?;
-        let mut spread = self.measure(&tau, config, f64::INFINITY);
-        for _ in 0..ROUNDS {
-            let next = self.weigh(spread).ok_or(Lack::Degenerate)?;
-            let moved = (next - tau).norm();
-            tau = next;
-            spread = self.measure(&tau, config, CUT * spread);
-            if moved < 1e-12 {
-                break;
-            }
+        let guess = self.guess(config, lean_sd, seed).ok_or(Lack::Degenerate)?;
+        let (motion, spread) = match lean_sd {
+            None => self.refine::<3>(guess, config, None, ROUNDS),
+            Some(_) => self.refine::<5>(guess, config, lean_sd, ROUNDS_OF_NORMAL),
         }
+        .ok_or(Lack::Degenerate)?;
         let inliers = self.mark(spread, config);
         if inliers < needed {
             return Err(Lack::Disagreement { inliers, samples, needed });
         }
-        self.linearise(tau, spread, samples, inliers).ok_or(Lack::Degenerate)
+        let found = match lean_sd {
+            None => self.linearise::<3>(&motion, spread, None),
+            Some(_) => self.linearise::<5>(&motion, spread, lean_sd),
+        };
+        found.map(|found| Found { samples, inliers, ..found }).ok_or(Lack::Degenerate)
     }
 
-    /// The best of many motions through two vectors each, by the truncated sum of squares (MSAC).
-    fn guess(&self, config: &Config, seed: u64) -> Option<Vector3<f64>> {
+    /// Iteratively re-weighted least squares from a guess, and the spread that it ends with.
+    fn refine<const D: usize>(
+        &mut self,
+        guess: Motion,
+        config: &Config,
+        lean_sd: Option<f64>,
+        rounds: usize,
+    ) -> Option<(Motion, f64)> {
+        let mut motion = guess;
+        let mut spread = self.measure(&motion, config, f64::INFINITY);
+        for _ in 0..rounds {
+            let prior = lean_sd.map_or(0.0, |sd| self.likeness() * (spread / sd).powi(2));
+            let step = self.advance::<D>(&motion, spread, prior)?;
+            motion.add(&step);
+            spread = self.measure(&motion, config, CUT * spread);
+            if step.norm() < 1e-12 {
+                break;
+            }
+        }
+        Some((motion, spread))
+    }
+
+    /// The best of many motions through two vectors each, by the truncated sum of squares (MSAC); over a normal that is
+    /// drawn where it is not known.
+    fn guess(&self, config: &Config, lean_sd: Option<f64>, seed: u64) -> Option<Motion> {
         let mut draws = ChaCha8Rng::seed_from_u64(seed);
         let stride = self.offered.len().div_ceil(JURY);
         let limit = config.seed_rad * config.seed_rad;
-        let mut best: Option<(f64, Vector3<f64>)> = None;
-        for _ in 0..GUESSES {
+        let mut best: Option<(f64, Motion)> = None;
+        for _ in 0..if lean_sd.is_some() { GUESSES_OF_NORMAL } else { GUESSES } {
             let pick: [&Sight; 2] =
                 std::array::from_fn(|_| &self.sights[self.offered[draws.random_range(0..self.offered.len())] as usize]);
-            let Some(tau) = through(&pick) else { continue };
+            let lean =
+                lean_sd.map_or([0.0; 2], |sd| std::array::from_fn(|_| 2.0 * sd * (2.0 * draws.random::<f64>() - 1.0)));
+            let Some(motion) = through(&pick, lean) else { continue };
             let cost: f64 = self
                 .offered
                 .iter()
                 .step_by(stride)
                 .map(|i| {
-                    let [x, y] = self.sights[*i as usize].off(&tau);
+                    let [x, y] = self.sights[*i as usize].off(&motion);
                     (x * x + y * y).min(limit)
                 })
                 .sum();
             if best.is_none_or(|(least, _)| cost < least) {
-                best = Some((cost, tau));
+                best = Some((cost, motion));
             }
         }
-        best.map(|(_, tau)| tau)
+        best.map(|(_, motion)| motion)
     }
 
-    /// Residuals under `tau`, and their spread for a vector of weight 1 by the median over those within `cut`.
-    fn measure(&mut self, tau: &Vector3<f64>, config: &Config, cut: f64) -> f64 {
+    /// Residuals under `motion`, and their spread for a vector of weight 1 by the median over those within `cut`.
+    fn measure(&mut self, motion: &Motion, config: &Config, cut: f64) -> f64 {
         self.scratch.clear();
         for sight in self.sights.iter_mut().filter(|sight| sight.offered) {
-            sight.residual = sight.off(tau);
+            sight.residual = sight.off(motion);
             let length = sight.length();
             let scaled = length * sight.weight.sqrt();
             sight.agrees = length <= config.agree_rad_max;
@@ -164,144 +261,43 @@ impl Fit {
         (*median / MEDIAN_LENGTH).max(SPREAD_MIN)
     }
 
-    /// One round of weighted least squares under Tukey's weight.
-    fn weigh(&self, spread: f64) -> Option<Vector3<f64>> {
-        let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
+    /// One round of weighted least squares under Tukey's weight; `prior` holds the lean to 0.
+    fn advance<const D: usize>(&self, motion: &Motion, spread: f64, prior: f64) -> Option<SVector<f64, D>> {
+        let (mut normal, mut right) = (SMatrix::<f64, D, D>::zeros(), SVector::<f64, D>::zeros());
         for sight in self.sights.iter().filter(|sight| sight.offered && sight.agrees) {
-            let weight = sight.weight * tukey(sight, spread);
+            let weight = sight.weight * sight.tukey(spread);
             if weight > 0.0 {
-                let rows = sight.rows();
+                let rows = sight.rows::<D>(motion);
                 normal += rows.transpose() * rows * weight;
-                right += rows.transpose() * sight.motion() * weight;
+                right += rows.transpose() * Vector2::from(sight.residual) * weight;
             }
         }
-        Some(invert(&normal)? * right)
+        for axis in 3..D {
+            normal[(axis, axis)] += prior;
+            right[axis] -= prior * motion.lean[axis - 3];
+        }
+        Some(linear::invert(&normal)? * right)
     }
 
     /// Marks and counts the vectors that agree.
     fn mark(&mut self, spread: f64, config: &Config) -> u32 {
         let mut inliers = 0;
         for sight in self.sights.iter_mut().filter(|sight| sight.offered) {
-            sight.agrees = tukey(sight, spread) > 0.0 && sight.length() <= config.agree_rad_max;
+            sight.agrees = sight.tukey(spread) > 0.0 && sight.length() <= config.agree_rad_max;
             inliers += u32::from(sight.agrees);
         }
         inliers
     }
-
-    /// The estimate's covariance by its own residuals (a sandwich: it holds where the confidences are wrong too), and
-    /// its first-order change with everything that all vectors share.
-    fn linearise(&mut self, tau: Vector3<f64>, spread: f64, samples: u32, inliers: u32) -> Option<Found> {
-        let (mut slope, mut noise) = (Matrix3::zeros(), Matrix3::zeros());
-        let (mut by_turn, mut by_shift, mut by_normal) = (Matrix3::zeros(), Matrix3x2::zeros(), Matrix3::zeros());
-        let mut stretch = 0.0;
-        for sight in self.sights.iter().filter(|sight| sight.offered && sight.agrees) {
-            let rows = sight.rows();
-            let bent = rows.transpose() * tukey_slope(sight, spread);
-            slope += bent * rows;
-            let pull = rows.transpose() * Vector2::from(sight.residual) * (sight.weight * tukey(sight, spread));
-            noise += pull * pull.transpose();
-            let [x, y] = sight.newer;
-            by_turn += bent * Matrix2x3::new(-x * y, 1.0 + x * x, -y, -(1.0 + y * y), x * y, x);
-            by_shift += bent;
-            let (ox, oy) = (sight.older[0], sight.older[1]);
-            let per_slope = Vector2::new(-tau.x + x * tau.z, -tau.y + y * tau.z);
-            by_normal += bent * per_slope * Vector3::new(ox, oy, 1.0).transpose();
-            stretch += sight.stretch * sight.stretch;
-        }
-        let inverse = invert(&slope)?;
-        let count = f64::from(inliers);
-        noise *= self.likeness() * count / (count - 1.5).max(1.0);
-        Some(Found {
-            tau,
-            covariance: inverse * noise * inverse.transpose(),
-            by_turn: inverse * by_turn,
-            by_shift: inverse * by_shift,
-            by_normal: inverse * by_normal,
-            samples,
-            inliers,
-            stretch: (stretch / count).sqrt(),
-        })
-    }
-
-    /// How many vectors stand for one independent vector: residuals that are alike carry no new knowledge.
-    ///
-    /// The sum of the residuals' autocorrelation over all distances, taken as separable along columns and rows. Each
-    /// sum ends where the correlation first falls to zero (Geyer's initial positive sequence): a network's error is
-    /// smooth over several cells and then ends, so that neither its nearest neighbours (as a first-order autoregression
-    /// would have it, three times too many) nor blocks of the image (too few) say how far it reaches.
-    fn likeness(&mut self) -> f64 {
-        self.scaled.clear();
-        self.scaled.extend(self.sights.iter().map(|sight| match sight.offered && sight.agrees {
-            true => sight.residual.map(|off| off * sight.weight.sqrt()),
-            false => [f64::NAN; 2],
-        }));
-        let rows = self.sights.len() / self.columns.max(1);
-        let mut factor = 1.0;
-        for (along_row, cells) in [(true, self.columns), (false, rows)] {
-            let mut sum = 1.0;
-            for lag in 1..cells {
-                let correlation = if along_row { self.alike(lag, lag) } else { self.alike(lag * self.columns, 0) };
-                if correlation <= 0.0 {
-                    break;
-                }
-                sum += 2.0 * correlation * (1.0 - lag as f64 / cells as f64);
-            }
-            factor *= sum;
-        }
-        factor
-    }
-
-    /// Correlation of the residuals of vectors that lie `apart` places from each other in the raster; the last `edge`
-    /// columns have no partner in their row.
-    fn alike(&self, apart: usize, edge: usize) -> f64 {
-        let (mut product, mut square) = (0.0, 0.0);
-        let partners = self.scaled.get(apart..).unwrap_or_default();
-        let both = self.scaled.chunks(self.columns).zip(partners.chunks(self.columns));
-        for (here, there) in both {
-            for ([ax, ay], [bx, by]) in here.iter().zip(there).take(self.columns - edge) {
-                let pair = ax * bx + ay * by;
-                if pair.is_finite() {
-                    product += pair;
-                    square += 0.5 * (ax * ax + ay * ay + bx * bx + by * by);
-                }
-            }
-        }
-        if square > 0.0 { product / square } else { 0.0 }
-    }
-}
-
-/// Tukey's weight of a vector's residual, 0…1.
-fn tukey(sight: &Sight, spread: f64) -> f64 {
-    let part = sight.weight * sight.length().powi(2) / (CUT * spread).powi(2);
-    if part < 1.0 { (1.0 - part).powi(2) } else { 0.0 }
-}
-
-/// Derivative of the weighted residual by the residual.
-fn tukey_slope(sight: &Sight, spread: f64) -> Matrix2<f64> {
-    let cut = (CUT * spread).powi(2);
-    let part = sight.weight * sight.length().powi(2) / cut;
-    if part >= 1.0 {
-        return Matrix2::zeros();
-    }
-    let residual = Vector2::from(sight.residual);
-    let bend = residual * residual.transpose() * (4.0 * (1.0 - part) * sight.weight / cut);
-    (Matrix2::identity() * (1.0 - part).powi(2) - bend) * sight.weight
 }
 
 /// The motion through two vectors, by least squares over their four equations.
-fn through(pick: &[&Sight; 2]) -> Option<Vector3<f64>> {
+fn through(pick: &[&Sight; 2], lean: [f64; 2]) -> Option<Motion> {
     let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
+    let still = Motion { tau: Vector3::zeros(), lean };
     for sight in pick {
-        let rows = sight.rows();
+        let rows = sight.rows::<3>(&still);
         normal += rows.transpose() * rows;
-        right += rows.transpose() * sight.motion();
+        right += rows.transpose() * Vector2::from(sight.off(&still));
     }
-    Some(invert(&normal)? * right)
-}
-
-/// The inverse, unless the matrix is singular beside its own size.
-fn invert(matrix: &Matrix3<f64>) -> Option<Matrix3<f64>> {
-    let size = matrix.trace().abs() / 3.0;
-    let regular = matrix.determinant().abs() > 1e-12 * size.powi(3);
-    if regular { matrix.try_inverse() } else { None }
+    Some(Motion { tau: linear::invert(&normal)? * right, lean })
 }

@@ -44,6 +44,8 @@ pub(super) struct Turn {
     pub(super) last: Vector3<f64>,
     /// rad² of the integrated angle, an axis.
     pub(super) variance: f64,
+    /// (rad/s)² of `last` − `first`, an axis; none where no gyro was there.
+    pub(super) swing_variance: Option<f64>,
 }
 
 impl Rates {
@@ -161,7 +163,9 @@ impl Rates {
         }
         let held = 0.5 * config.spin_sd_rad_s2 * (held_first.powi(2) + held_last.powi(2));
         let variance = noise + (config.gyro_bias_sd_rad_s * interval_s).powi(2) + held * held;
-        Ok(Turn { rotation, mean: angle / interval_s, first, last, variance })
+        // Interpolating between two samples takes a third off the variance, on the average.
+        let swing_variance = Some(4.0 / 3.0 * variance_last);
+        Ok(Turn { rotation, mean: angle / interval_s, first, last, variance, swing_variance })
     }
 
     /// Seconds of the interval that lie between samples near enough to each other.

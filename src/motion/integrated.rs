@@ -106,9 +106,9 @@ impl Odometer {
     /// The flow straight below between two frames of `camera_size` (columns, rows). Blind flow is no flow, but the gyro
     /// and the distance stand by themselves.
     pub fn integrated(&mut self, flow: &Flow<'_>, camera_size: [u32; 2], blind: bool) -> Integrated {
-        let interval_s = flow.newer.seconds_since(flow.older);
-        let gyro = self.rates.turn(flow.older, flow.newer, &self.config).ok().map(|turn| turn.mean * interval_s);
-        let ground = self.ground(flow);
+        let span = self.span(flow);
+        let gyro = self.rates.turn(span.older, span.newer, &self.config).ok().map(|turn| turn.mean * span.seconds);
+        let ground = self.ground(span);
         let cosine = -ground.normal.z;
         let distance = ground.distance.ok().map(|d| d.metres / cosine).filter(|_| cosine > 0.1);
         let found = if blind { Err(NoFlow::Blind) } else { self.plane(flow, camera_size) };

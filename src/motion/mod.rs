@@ -4,18 +4,21 @@
 //! integrated over exactly the interval, turns m₂ back into the older frame's axes: p₂. With n the unit vector to the
 //! ground, d the distance along it and t the camera's displacement, τ = t/d obeys
 //! x₂ − x₁ = (n·m₁)(−τ_x + x₂ τ_z) and the same in y: exact, and linear in τ. A seeded RANSAC starts the fit, and
-//! iteratively re-weighted least squares ends it.
+//! iteratively re-weighted least squares ends it. Where n is not known either it is fitted with τ.
 
 mod config;
+mod drift;
 mod fit;
 mod ground;
 mod gyro;
 mod integrated;
 mod lens;
+mod linear;
 mod odometer;
 mod quality;
 
 pub use config::{AttitudeUse, Config, GyroUse, Mount, REASONS};
+pub use drift::{Diagnosis, Drift};
 pub use integrated::{Integrated, NoFlow};
 pub use odometer::Odometer;
 pub use quality::{BOUND_M_S, BOUND_PART, BOUND_PER_S};
@@ -24,7 +27,9 @@ use crate::clock::Stamp;
 
 /// Translational velocity of the body, FLU (x forward, y left, z up), at the newer frame's stamp.
 ///
-/// It is the mean over the interval between the frames, in the body axes of the newer frame.
+/// It is the mean over the interval between the middles of both exposures, in the body axes of the newer frame. A network
+/// errs alike in frames that are alike: errors of successive steps are not independent, and a filter that takes them as
+/// such trusts them too much.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Velocity {
     /// Stamp of the older frame.

@@ -1,9 +1,10 @@
 //! The odometer: keeps gyro, range and calibration, and turns each step's flow into the body's velocity.
 
-use nalgebra::{Matrix3, Matrix6, Quaternion, Rotation3, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix3x5, Matrix6, Quaternion, Rotation3, UnitQuaternion, Vector3, Vector6};
 
 use super::{
-    AttitudeUse, Config, Error, GyroUse, Lack, Mount, NoDistance, Scale, Velocity,
+    AttitudeUse, Config, Diagnosis, Drift, Error, GyroUse, Lack, Mount, NoDistance, Scale, Velocity,
+    drift::{Turned, Watch},
     fit::{Fit, Found, Sight},
     ground::Ranges,
     gyro::{Rates, Turn},
@@ -12,6 +13,7 @@ use super::{
     quality,
 };
 use crate::{
+    clock::Stamp,
     flow::{Flow, Grid},
     wire::{CameraInfo, Imu, Range},
 };
@@ -34,14 +36,29 @@ pub struct Odometer {
     ranges: Ranges,
     fit: Fit,
     pub(super) below: Below,
+    watch: Watch,
+    /// From a frame's stamp to the middle of its exposure.
+    half_exposure_ns: i64,
 }
 
 /// The ground as seen from the older frame.
 pub(super) struct Ground {
     /// Unit vector to the ground, body axes.
     pub(super) normal: Vector3<f64>,
+    /// The two directions that it may be off in.
+    tangents: [Vector3<f64>; 2],
+    /// How far it may be off where it is given, and where it is fitted.
     tilt_sd: f64,
+    lean_sd: Option<f64>,
     pub(super) distance: Result<Distance, NoDistance>,
+}
+
+/// The middles of both exposures.
+#[derive(Clone, Copy)]
+pub(super) struct Span {
+    pub(super) older: Stamp,
+    pub(super) newer: Stamp,
+    pub(super) seconds: f64,
 }
 
 pub(super) struct Distance {
@@ -84,7 +101,25 @@ impl Odometer {
             ranges: Ranges::new(),
             fit: Fit::default(),
             below: Below::default(),
+            watch: Watch::default(),
+            half_exposure_ns: 0,
         })
+    }
+
+    /// For a camera whose stamps are the beginnings of exposures that last `exposure_s`.
+    pub fn exposing(mut self, exposure_s: f64) -> Odometer {
+        self.half_exposure_ns = (0.5e9 * exposure_s).round() as i64;
+        self
+    }
+
+    /// How well gyro and camera agree on the body's turns, once there were enough of them.
+    pub fn drift(&self) -> Option<Drift> {
+        self.watch.found()
+    }
+
+    /// What they disagree on beyond doubt.
+    pub fn diagnosis(&self) -> Option<Diagnosis> {
+        self.drift()?.diagnosis(&self.config)
     }
 
     /// Takes a calibration.
@@ -113,26 +148,39 @@ impl Odometer {
         if lens.size() != [0, 0] && lens.size() != camera_size {
             return Err(Lack::CameraSize { calibrated: lens.size(), frame: camera_size });
         }
-        let interval_s = flow.newer.seconds_since(flow.older);
-        if interval_s <= 0.0 {
+        let span = self.span(flow);
+        if span.seconds <= 0.0 {
             return Err(Lack::Degenerate);
         }
-        let focal = lens.focal();
-        let turn = self.turn(flow, interval_s)?;
-        let ground = self.ground(flow);
-        self.look(flow, &turn, &ground.normal);
+        let constant = self.config.flow_shared_sd_cells * f64::from(flow.grid.scale[0]) / lens.focal();
+        let turn = self.turn(span)?;
+        let mut ground = self.ground(span);
+        self.look(flow, &turn, &ground);
         let seed = u64::from(self.config.seed) ^ flow.older.ns().cast_unsigned();
-        let found = self.fit.solve(&self.config, seed)?;
-        let constant = self.config.flow_shared_sd_widths * f64::from(camera_size[0]) / focal;
+        let found = self.fit.solve(&self.config, ground.lean_sd, seed)?;
+        self.compare(&turn, &found, span);
         let shared = (constant.powi(2) + (self.config.flow_shared_sd_part * found.stretch).powi(2)).sqrt();
-        Ok(self.conclude(flow, &turn, &ground, &found, interval_s, shared))
+        if ground.lean_sd.is_some() {
+            let [a, b] = ground.tangents;
+            ground.normal = (ground.normal + a * found.lean[0] + b * found.lean[1]).normalize();
+            ground.distance = self.distance(span, &ground.normal);
+        }
+        let velocity = self.conclude(&turn, &ground, &found, span, shared);
+        Ok(Velocity { older: flow.older, newer: flow.newer, ..velocity })
+    }
+
+    /// From the middle of the older exposure to the middle of the newer one.
+    pub(super) fn span(&self, flow: &Flow<'_>) -> Span {
+        let middle = |stamp: Stamp| Stamp(stamp.ns().saturating_add(self.half_exposure_ns));
+        let (older, newer) = (middle(flow.older), middle(flow.newer));
+        Span { older, newer, seconds: newer.seconds_since(older) }
     }
 
     /// How the body turned, or how it may have where that need not be known.
-    fn turn(&self, flow: &Flow<'_>, interval_s: f64) -> Result<Turn, Lack> {
+    fn turn(&self, span: Span) -> Result<Turn, Lack> {
         let measured = match self.rates.is_empty() {
             true => Err(Lack::Gyro),
-            false => self.rates.turn(flow.older, flow.newer, &self.config),
+            false => self.rates.turn(span.older, span.newer, &self.config),
         };
         match (measured, self.config.gyro) {
             (Err(_), GyroUse::IfPresent) => Ok(Turn {
@@ -140,35 +188,61 @@ impl Odometer {
                 mean: Vector3::zeros(),
                 first: Vector3::zeros(),
                 last: Vector3::zeros(),
-                variance: (self.config.rate_unknown_sd_rad_s * interval_s).powi(2),
+                variance: (self.config.rate_unknown_sd_rad_s * span.seconds).powi(2),
+                swing_variance: None,
             }),
             (measured, _) => measured,
         }
     }
 
-    pub(super) fn ground(&self, flow: &Flow<'_>) -> Ground {
+    pub(super) fn ground(&self, span: Span) -> Ground {
         let config = &self.config;
         let stated = match config.attitude {
-            AttitudeUse::Imu => self.rates.up_at(flow.older, config.range_age_s_max),
-            AttitudeUse::Level => None,
+            AttitudeUse::Imu => self.rates.up_at(span.older, config.range_age_s_max),
+            AttitudeUse::Level | AttitudeUse::Fit => None,
         };
         let (up, tilt_sd) = stated.unwrap_or((Vector3::z(), config.level_sd_rad));
         let normal = -up;
-        let distance = self.ranges.at(flow.older, flow.newer, config).and_then(|beam| {
-            let cosine = normal.dot(&self.beam);
-            let hit =
-                Vector3::from(config.range_offset_m) - Vector3::from(config.camera_offset_m) + self.beam * beam.range;
-            let metres = normal.dot(&hit);
-            if cosine < config.beam_cosine_min || metres <= 0.0 {
-                return Err(NoDistance::Slanting { cosine, needed: config.beam_cosine_min });
-            }
-            Ok(Distance { metres, sd: cosine * beam.variance.sqrt(), hit })
+        let side = normal.cross(&Vector3::x()).try_normalize(0.1).unwrap_or_else(Vector3::y);
+        let lean_sd = (config.attitude == AttitudeUse::Fit).then_some(config.lean_sd_rad);
+        Ground {
+            normal,
+            tangents: [side, normal.cross(&side)],
+            tilt_sd: if lean_sd.is_some() { 0.0 } else { tilt_sd },
+            lean_sd,
+            distance: self.distance(span, &normal),
+        }
+    }
+
+    /// From the camera to the ground along its normal.
+    fn distance(&self, span: Span, normal: &Vector3<f64>) -> Result<Distance, NoDistance> {
+        let config = &self.config;
+        let beam = self.ranges.at(span.older, span.newer, config)?;
+        let cosine = normal.dot(&self.beam);
+        let hit = Vector3::from(config.range_offset_m) - Vector3::from(config.camera_offset_m) + self.beam * beam.range;
+        let metres = normal.dot(&hit);
+        if cosine < config.beam_cosine_min || metres <= 0.0 {
+            return Err(NoDistance::Slanting { cosine, needed: config.beam_cosine_min });
+        }
+        Ok(Distance { metres, sd: cosine * beam.variance.sqrt(), hit })
+    }
+
+    /// Keeps what the flow shows of the turn beside what the gyro says.
+    fn compare(&mut self, turn: &Turn, found: &Found, span: Span) {
+        let (Some(leftover), Some(swing_variance)) = (found.leftover, turn.swing_variance) else { return };
+        let mount = self.mount.matrix();
+        self.watch.take(&Turned {
+            leftover: mount * leftover.angle,
+            information: mount * leftover.information * mount.transpose(),
+            angle: turn.mean * span.seconds,
+            swing: turn.last - turn.first,
+            swing_variance,
+            interval_s: span.seconds,
         });
-        Ground { normal, tilt_sd, distance }
     }
 
     /// Fills the fit's raster: rays of both ends of each vector, the turn taken off.
-    fn look(&mut self, flow: &Flow<'_>, turn: &Turn, normal: &Vector3<f64>) {
+    fn look(&mut self, flow: &Flow<'_>, turn: &Turn, ground: &Ground) {
         let Some(lens) = &self.lens else { return };
         let grid = flow.grid;
         let mut step = 1;
@@ -184,7 +258,8 @@ impl Odometer {
             self.rays.extend(rows().flat_map(|row| columns().map(move |column| lens.ray(pixel(row, column)))));
         }
         let back = self.mount.inverse() * turn.rotation.to_rotation_matrix() * self.mount;
-        let normal = self.mount.inverse() * normal;
+        let normal = self.mount.inverse() * ground.normal;
+        let leans = ground.lean_sd.map(|_| ground.tangents.map(|tangent| self.mount.inverse() * tangent));
         let sight = |column: usize, row: usize, older: Option<[f64; 2]>| -> Option<Sight> {
             let cell = row * grid.width + column;
             let confidence = f64::from(*flow.confidence.get(cell)?);
@@ -206,7 +281,8 @@ impl Odometer {
             let weight = -2.0 * (1.0 - confidence.min(0.999)).ln();
             let stretch = ((newer[0] - older[0]).powi(2) + (newer[1] - older[1]).powi(2)).sqrt();
             let newer = [turned.x / turned.z, turned.y / turned.z];
-            Some(Sight { older, newer, slope, weight, stretch, offered: true, ..Sight::default() })
+            let lean = leans.map_or([0.0; 2], |leans| leans.map(|lean| lean.dot(&ray)));
+            Some(Sight { older, newer, slope, lean, weight, stretch, offered: true, ..Sight::default() })
         };
         self.fit.columns = columns().count();
         self.fit.sights.clear();
@@ -216,20 +292,15 @@ impl Odometer {
     }
 
     /// From the fit's camera axes to the newer body axes, with everything that makes the velocity uncertain.
-    fn conclude(
-        &self,
-        flow: &Flow<'_>,
-        turn: &Turn,
-        ground: &Ground,
-        found: &Found,
-        interval_s: f64,
-        shared: f64,
-    ) -> Velocity {
+    fn conclude(&self, turn: &Turn, ground: &Ground, found: &Found, span: Span, shared: f64) -> Velocity {
         let config = &self.config;
         let forward = turn.rotation.inverse();
         let to_newer = forward.to_rotation_matrix() * self.mount;
         let distance = ground.distance.as_ref();
-        let scale = distance.map_or(1.0, |d| d.metres) / interval_s;
+        let interval_s = span.seconds;
+        // A normal that leans is longer than a unit: what is too long there is too short in τ.
+        let unit = (1.0 + found.lean[0].powi(2) + found.lean[1].powi(2)).sqrt();
+        let scale = distance.map_or(1.0, |d| d.metres) / interval_s * unit;
         // The camera's lever arm turns with the body; without a distance there are no metres to take it off in.
         let arm = if distance.is_ok() { Vector3::from(config.camera_offset_m) } else { Vector3::zeros() };
         let lever = (arm - forward * arm) / interval_s;
@@ -237,12 +308,18 @@ impl Odometer {
         let linear = camera - lever;
         let mut spread = Spread::default();
         let to_body = to_newer.matrix() * scale;
-        spread.linear(&(to_body * found.covariance * to_body.transpose()));
+        // What is wrong about the normal is wrong about the distance too.
+        let longer = |tilt: &Vector3<f64>| distance.map_or(0.0, |d| tilt.dot(&d.hit) / d.metres);
+        let leans = ground
+            .tangents
+            .map(|tangent| if ground.lean_sd.is_some() { camera * longer(&tangent) } else { Vector3::zeros() });
+        let both = Matrix3x5::from_fn(|i, j| if j < 3 { to_body[(i, j)] } else { leans[j - 3][i] });
+        spread.linear(&(both * found.covariance * both.transpose()));
         for column in found.by_shift.column_iter() {
-            spread.error(to_body * column * shared, Vector3::zeros());
+            spread.error(both * column * shared, Vector3::zeros());
         }
         // An error of the turn, in the older body's axes, as it reaches the velocity and the mean rate.
-        let by_turn = to_body * found.by_turn * self.mount.inverse().matrix();
+        let by_turn = both * found.by_turn * self.mount.inverse().matrix();
         let turned = |error: Vector3<f64>| (by_turn * error - (error / interval_s).cross(&arm), error / interval_s);
         for axis in 0..3 {
             let (v, w) = turned(Vector3::ith(axis, turn.variance.sqrt()));
@@ -255,17 +332,15 @@ impl Odometer {
             let (v, w) = turned(rate * jitter);
             spread.error(v - linear * (jitter / interval_s), w - turn.mean * (jitter / interval_s));
         }
-        let side = ground.normal.cross(&Vector3::x()).try_normalize(0.1).unwrap_or_else(Vector3::y);
-        for tangent in [side, ground.normal.cross(&side)] {
+        for tangent in ground.tangents {
             let tilt = tangent * ground.tilt_sd;
             let moved = to_body * found.by_normal * (self.mount.inverse() * tilt);
-            let longer = distance.map_or(0.0, |d| tilt.dot(&d.hit) / d.metres);
-            spread.error(moved - camera * longer, Vector3::zeros());
+            spread.error(moved - camera * longer(&tilt), Vector3::zeros());
         }
         if let Ok(d) = distance {
             spread.error(camera * (d.sd / d.metres), Vector3::zeros());
         }
-        if config.gyro == GyroUse::IfPresent && self.rates.turn(flow.older, flow.newer, config).is_err() {
+        if turn.swing_variance.is_none() {
             spread.unobserved();
         }
         let scale = match &ground.distance {
@@ -273,8 +348,8 @@ impl Odometer {
             Err(why) => Scale::PerDistance(*why),
         };
         Velocity {
-            older: flow.older,
-            newer: flow.newer,
+            older: span.older,
+            newer: span.newer,
             linear: linear.into(),
             angular: turn.mean.into(),
             covariance: spread.rows(),

@@ -207,3 +207,14 @@ fn a_failure_is_told_once_after_what_waits() {
     drop(sender);
     assert_eq!(latest.next(Duration::from_secs(20)).unwrap(), Next::End);
 }
+
+#[test]
+fn the_gyro_of_half_the_exposure_comes_before_its_frame() {
+    let (sender, latest) = mailbox(8);
+    let mut latest = latest.exposing(10e-9);
+    sender.put(frame(20));
+    [18, 25, 26].into_iter().for_each(|stamp| sender.put(imu(stamp)));
+    assert_eq!(take(&mut latest), Given::Small(18));
+    assert_eq!(take(&mut latest), Given::Small(25));
+    assert_eq!(take(&mut latest), Given::Frame(20));
+}

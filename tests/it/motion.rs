@@ -6,7 +6,8 @@ use nightflow::{
     darkness::noise::Normals,
     flow::{Flow, Grid},
     motion::{
-        BOUND_M_S, BOUND_PART, Config, Error, GyroUse, Lack, Mount, NoDistance, Odometer, REASONS, Scale, Velocity,
+        AttitudeUse, BOUND_M_S, BOUND_PART, Config, Diagnosis, Error, GyroUse, Lack, Mount, NoDistance, Odometer,
+        REASONS, Scale, Velocity,
     },
     wire::{CameraInfo, Header, Imu, Quaternion, Range, Vector3 as Wire3},
 };
@@ -252,7 +253,7 @@ fn the_imu_may_be_mounted_askew() {
 
 /// Noise as the settings state it, 30 % of the vectors wrong by tens of pixels: the error must be as large as the
 /// covariance says, and as often within the bound as the quality says.
-fn honesty(camera: Mount, correlated: bool) -> (f64, f64, f64) {
+fn honesty(camera: Mount, correlated: bool, attitude: AttitudeUse) -> (f64, f64, f64) {
     let (mut linear, mut all, mut worst) = (0.0, 0.0, 0.0_f64);
     let (mut quality, mut hits) = (0.0, 0.0);
     let rounds = 400;
@@ -260,13 +261,15 @@ fn honesty(camera: Mount, correlated: bool) -> (f64, f64, f64) {
         let mut draws = Normals::new(77, round);
         let mut truth = Truth::hovering(5.0);
         truth.config.camera = camera;
+        truth.config.attitude = attitude;
         truth.config.seed = round as u32;
         let mut three = |size: f64| Vector3::from_fn(|_, _| size * draws.draw());
         (truth.velocity, truth.rates) = (three(1.5), three(0.2));
         truth.attitude = UnitQuaternion::from_scaled_axis(three(0.05));
         let mut seen = truth.exact();
         let noise: Vec<f64> = (0..2 * GRID.cells()).map(|_| draws.draw()).collect();
-        let shared = [draws.draw(), draws.draw()].map(|n| n * truth.config.flow_shared_sd_widths * f64::from(SIZE[0]));
+        let shared =
+            [draws.draw(), draws.draw()].map(|n| n * truth.config.flow_shared_sd_cells * f64::from(GRID.scale[0]));
         for cell in 0..GRID.cells() {
             let wrong = draws.uniform() < 0.3;
             for (axis, shared) in shared.iter().enumerate() {
@@ -302,9 +305,16 @@ fn honesty(camera: Mount, correlated: bool) -> (f64, f64, f64) {
 
 #[test]
 fn the_covariance_is_honest_among_outliers() {
-    for (camera, correlated) in [(Mount::Downward, false), (Mount::Forward, false), (Mount::Downward, true)] {
-        let (linear, all, worst) = honesty(camera, correlated);
-        println!("{camera:?}, correlated {correlated}: NEES {linear:.3} linear, {all:.3} all, worst {worst:.3} m/s");
+    for (camera, correlated, attitude) in [
+        (Mount::Downward, false, AttitudeUse::Imu),
+        (Mount::Forward, false, AttitudeUse::Imu),
+        (Mount::Downward, true, AttitudeUse::Imu),
+        (Mount::Downward, true, AttitudeUse::Fit),
+    ] {
+        let (linear, all, worst) = honesty(camera, correlated, attitude);
+        println!(
+            "{camera:?}, correlated {correlated}, {attitude:?}: NEES {linear:.3} linear, {all:.3} all, worst {worst:.3} m/s"
+        );
         assert!((0.6..1.6).contains(&linear), "{camera:?} correlated {correlated}: mean NEES {linear}");
         assert!((0.5..1.6).contains(&all), "{camera:?} correlated {correlated}: mean NEES of all six {all}");
         assert!(worst < 0.6, "{camera:?}: {worst} m/s off");
@@ -472,6 +482,105 @@ fn flow_that_agrees_on_nothing_gives_no_velocity() {
     assert!(matches!(lack, Lack::Disagreement { .. }), "{lack}");
     seen.confidence.fill(0.0);
     assert!(matches!(truth.velocity(&seen, true), Err(Lack::Disagreement { samples: 0, .. })));
+}
+
+#[test]
+fn an_unknown_normal_is_seen_in_the_flow() {
+    for (roll, pitch) in [(0.0, 0.0), (0.15, -0.1), (-0.25, 0.2)] {
+        let mut truth = Truth::hovering(3.0);
+        truth.config.attitude = AttitudeUse::Fit;
+        truth.attitude = UnitQuaternion::from_euler_angles(roll, pitch, 0.4);
+        truth.velocity = Vector3::new(3.0, -1.5, 0.5);
+        truth.rates = Vector3::new(0.2, -0.1, 0.3);
+        let seen = truth.exact();
+        let found = truth.velocity(&seen, true).unwrap();
+        let error = (Vector3::from(found.linear) - truth.expected()).norm();
+        assert!(error < 2e-3, "roll {roll}, pitch {pitch}: {error} m/s off, {found:?}");
+        truth.config.attitude = AttitudeUse::Level;
+        let level = truth.velocity(&seen, true).unwrap();
+        let off = (Vector3::from(level.linear) - truth.expected()).norm();
+        assert!(roll == 0.0 || off > 20.0 * error, "level is {off} m/s off, fitted {error}");
+    }
+}
+
+#[test]
+fn the_gyro_is_looked_at_in_the_middle_of_the_exposure() {
+    // The rate grows by 20 rad/s², so that ten milliseconds of difference are 0.2 rad/s.
+    let mut truth = Truth::hovering(5.0);
+    let rate = |ns: i64| Vector3::new(20.0 * (ns - OLDER_NS) as f64 * 1e-9, 0.0, 0.0);
+    truth.rates = rate((OLDER_NS + truth.newer_ns()) / 2 + 10_000_000);
+    let seen = truth.exact();
+    let velocity = |exposure_s: f64| {
+        let mut odometer = Odometer::new(&truth.config).unwrap().exposing(exposure_s);
+        odometer.info(&calibration()).unwrap();
+        for ns in (-4..12).map(|k| OLDER_NS + k * 5_000_000) {
+            odometer.imu(&imu(ns, rate(ns), None)).unwrap();
+        }
+        odometer.range(&reach(OLDER_NS, 5.0)).unwrap();
+        odometer.velocity(&truth.flow(&seen), SIZE).unwrap()
+    };
+    let (known, unknown) = (velocity(0.02), velocity(0.0));
+    assert!(Vector3::from(known.linear).norm() < 1e-4, "{known:?}");
+    assert!(Vector3::from(unknown.linear).norm() > 0.5, "{unknown:?}");
+    assert_eq!(
+        (known.older, known.newer),
+        (Stamp(OLDER_NS), Stamp(truth.newer_ns())),
+        "stamps stay those of the frames"
+    );
+}
+
+/// A flight that turns to and fro, with a flow that is `scale` times too long and a gyro clock that is ahead.
+fn turning(scale: f64, ahead_ns: i64) -> Odometer {
+    let phase = |axis: usize, at: f64| (4.0 + axis as f64) * at + axis as f64;
+    let rates = |at: f64| Vector3::from_fn(|axis, _| 0.4 * phase(axis, at).cos());
+    let turned = |at: f64| Vector3::from_fn(|axis, _| 0.4 * phase(axis, at).sin() / (4.0 + axis as f64));
+    let mut draws = Normals::new(3, 9);
+    let mut truth = Truth::hovering(5.0);
+    truth.velocity = Vector3::new(1.5, -0.5, 0.2);
+    let mut odometer = Odometer::new(&truth.config).unwrap();
+    odometer.info(&calibration()).unwrap();
+    let step_ns = truth.newer_ns() - OLDER_NS;
+    let mut gyro_ns = OLDER_NS - 50_000_000;
+    for step in 0..300 {
+        let older_ns = OLDER_NS + step * step_ns;
+        let [from, to] = [older_ns, older_ns + step_ns].map(|ns| (ns - OLDER_NS) as f64 * 1e-9);
+        truth.rates = (turned(to) - turned(from)) / (to - from);
+        let mut seen = truth.exact();
+        seen.vectors.iter_mut().for_each(|v| *v = (scale * f64::from(*v) + 0.3 * draws.draw()) as f32);
+        while gyro_ns <= older_ns + step_ns + 10_000_000 {
+            let noise = Vector3::from_fn(|_, _| 0.005 * draws.draw());
+            odometer.imu(&imu(gyro_ns + ahead_ns, rates((gyro_ns - OLDER_NS) as f64 * 1e-9) + noise, None)).unwrap();
+            gyro_ns += 5_000_000;
+        }
+        odometer.range(&reach(older_ns, 5.0)).unwrap();
+        let flow = Flow { older: Stamp(older_ns), newer: Stamp(older_ns + step_ns), ..truth.flow(&seen) };
+        odometer.velocity(&flow, SIZE).unwrap();
+    }
+    odometer
+}
+
+#[test]
+fn a_gyro_clock_that_is_off_is_told_with_its_figure() {
+    let late = turning(1.0, -5_000_000);
+    let drift = late.drift().unwrap();
+    println!("{drift:?}");
+    assert!((drift.offset_s + 5e-3).abs() < 3.0 * drift.offset_sd_s + 1e-4 && drift.offset_sd_s < 5e-4, "{drift:?}");
+    let said = late.diagnosis().unwrap().to_string();
+    assert!(said.starts_with("the gyro's clock is ") && said.ends_with(" ms behind the camera's"), "{said}");
+}
+
+#[test]
+fn a_flow_that_turns_too_far_is_told_with_its_figure() {
+    let long = turning(1.03, 0);
+    let drift = long.drift().unwrap();
+    println!("{drift:?}");
+    for axis in 0..2 {
+        let (off, sd) = ((drift.scale[axis] - 1.03).abs(), drift.scale_sd[axis]);
+        assert!(off < 3.0 * sd + 1e-3 && sd < 0.01, "{drift:?}");
+    }
+    assert!(matches!(long.diagnosis(), Some(Diagnosis::Scale { .. })), "{drift:?}");
+    let right = turning(1.0, 0);
+    assert_eq!(right.diagnosis(), None, "{:?}", right.drift());
 }
 
 #[test]

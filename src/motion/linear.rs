@@ -1,0 +1,132 @@
+//! How the fit's result changes with whatever is uncertain, to first order: residuals and how alike they are, the turn, a
+//! shift of all vectors, the normal.
+
+use nalgebra::{Matrix3, Matrix5, Matrix5x2, Matrix5x3, SMatrix, SVector, Vector2, Vector3};
+
+use super::fit::{Fit, Found, Motion};
+
+/// The turn that is left in the vectors: by how much what the gyro said is more than what they show.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Leftover {
+    /// Radians, optical axes.
+    pub(super) angle: Vector3<f64>,
+    /// Inverse covariance, by the residuals.
+    pub(super) information: Matrix3<f64>,
+}
+
+impl Fit {
+    /// The estimate's covariance by its own residuals (a sandwich: it holds where the confidences are wrong too), and
+    /// its change with everything that all vectors share. `lean_sd` is how well the normal was known, where it is
+    /// fitted (D is 5).
+    pub(super) fn linearise<const D: usize>(
+        &mut self,
+        motion: &Motion,
+        spread: f64,
+        lean_sd: Option<f64>,
+    ) -> Option<Found> {
+        let (mut slope, mut noise) = (SMatrix::<f64, D, D>::zeros(), SMatrix::<f64, D, D>::zeros());
+        let (mut by_turn, mut by_normal) = (SMatrix::<f64, D, 3>::zeros(), SMatrix::<f64, D, 3>::zeros());
+        let mut by_shift = SMatrix::<f64, D, 2>::zeros();
+        let (mut turn_slope, mut turn_pull) = (Matrix3::zeros(), Vector3::zeros());
+        let (mut stretch, mut count) = (0.0, 0.0);
+        for sight in self.sights.iter().filter(|sight| sight.offered && sight.agrees) {
+            let (rows, turned) = (sight.rows::<D>(motion), sight.turned());
+            let by = sight.tukey_slope(spread);
+            let bent = rows.transpose() * by;
+            slope += bent * rows;
+            let weighted = Vector2::from(sight.residual) * (sight.weight * sight.tukey(spread));
+            let pull: SVector<f64, D> = rows.transpose() * weighted;
+            noise += pull * pull.transpose();
+            by_turn += bent * turned;
+            by_shift += bent;
+            by_normal +=
+                bent * sight.per_slope(&motion.tau) * Vector3::new(sight.older[0], sight.older[1], 1.0).transpose();
+            turn_slope += turned.transpose() * by * turned;
+            turn_pull += turned.transpose() * weighted;
+            stretch += sight.stretch * sight.stretch;
+            count += 1.0;
+        }
+        let likeness = self.likeness();
+        noise *= likeness * count / f64::max(count - 0.5 * D as f64, 1.0);
+        if let Some(sd) = lean_sd {
+            let prior = likeness * (spread / sd).powi(2);
+            for axis in 3..D {
+                slope[(axis, axis)] += prior;
+                noise[(axis, axis)] += (prior * sd).powi(2);
+            }
+        }
+        let inverse = invert(&slope)?;
+        let apart = turn_slope - by_turn.transpose() * inverse * by_turn;
+        let leftover = invert(&apart)
+            .map(|turn| Leftover { angle: turn * turn_pull, information: apart / (likeness * spread * spread) });
+        let found = inverse * noise * inverse.transpose();
+        let (by_turn, by_shift, by_normal) = (inverse * by_turn, inverse * by_shift, inverse * by_normal);
+        let given = lean_sd.is_none();
+        Some(Found {
+            tau: motion.tau,
+            lean: motion.lean,
+            covariance: Matrix5::from_fn(|i, j| if i < D && j < D { found[(i, j)] } else { 0.0 }),
+            by_turn: Matrix5x3::from_fn(|i, j| if i < D { by_turn[(i, j)] } else { 0.0 }),
+            by_shift: Matrix5x2::from_fn(|i, j| if i < D { by_shift[(i, j)] } else { 0.0 }),
+            by_normal: Matrix3::from_fn(|i, j| if given { by_normal[(i, j)] } else { 0.0 }),
+            leftover,
+            samples: 0,
+            inliers: 0,
+            stretch: (stretch / f64::max(count, 1.0)).sqrt(),
+        })
+    }
+
+    /// How many vectors stand for one independent vector: residuals that are alike carry no new knowledge.
+    ///
+    /// The sum of the residuals' autocorrelation over all distances, taken as separable along columns and rows. Each
+    /// sum ends where the correlation first falls to zero (Geyer's initial positive sequence): a network's error is
+    /// smooth over several cells and then ends, so that neither its nearest neighbours (as a first-order autoregression
+    /// would have it, three times too many) nor blocks of the image (too few) say how far it reaches.
+    pub(super) fn likeness(&mut self) -> f64 {
+        self.scaled.clear();
+        self.scaled.extend(self.sights.iter().map(|sight| match sight.offered && sight.agrees {
+            true => sight.residual.map(|off| off * sight.weight.sqrt()),
+            false => [f64::NAN; 2],
+        }));
+        let rows = self.sights.len() / self.columns.max(1);
+        let mut factor = 1.0;
+        for (along_row, cells) in [(true, self.columns), (false, rows)] {
+            let mut sum = 1.0;
+            for lag in 1..cells {
+                let correlation = if along_row { self.alike(lag, lag) } else { self.alike(lag * self.columns, 0) };
+                if correlation <= 0.0 {
+                    break;
+                }
+                sum += 2.0 * correlation * (1.0 - lag as f64 / cells as f64);
+            }
+            factor *= sum;
+        }
+        factor
+    }
+
+    /// Correlation of the residuals of vectors that lie `apart` places from each other in the raster; the last `edge`
+    /// columns have no partner in their row.
+    fn alike(&self, apart: usize, edge: usize) -> f64 {
+        let (mut product, mut square) = (0.0, 0.0);
+        let partners = self.scaled.get(apart..).unwrap_or_default();
+        let both = self.scaled.chunks(self.columns).zip(partners.chunks(self.columns));
+        for (here, there) in both {
+            for ([ax, ay], [bx, by]) in here.iter().zip(there).take(self.columns - edge) {
+                let pair = ax * bx + ay * by;
+                if pair.is_finite() {
+                    product += pair;
+                    square += 0.5 * (ax * ax + ay * ay + bx * bx + by * by);
+                }
+            }
+        }
+        if square > 0.0 { product / square } else { 0.0 }
+    }
+}
+
+/// The inverse, unless the matrix is singular beside its own size.
+pub(super) fn invert<const D: usize>(matrix: &SMatrix<f64, D, D>) -> Option<SMatrix<f64, D, D>> {
+    let inverse = matrix.try_inverse()?;
+    // Each unknown on its own scale: how much of what is known about it is left once the others are unknown too.
+    let known = (0..D).all(|axis| matrix[(axis, axis)] * inverse[(axis, axis)] < 1e9);
+    known.then_some(inverse)
+}
