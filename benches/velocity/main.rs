@@ -18,6 +18,11 @@ use nightflow::{
 };
 
 mod flights;
+mod opencv;
+mod plot;
+#[allow(dead_code)]
+#[path = "../rivals/mod.rs"]
+mod rivals;
 mod seen;
 mod tables;
 
@@ -34,6 +39,7 @@ struct Asked {
     threads: usize,
     cache: Option<PathBuf>,
     csv: Option<PathBuf>,
+    plot: Option<PathBuf>,
     /// `[motion]` settings that differ, as TOML.
     motion: Config,
 }
@@ -51,6 +57,7 @@ impl Asked {
             threads: 2,
             cache: None,
             csv: None,
+            plot: None,
             motion: Config::default(),
         };
         let mut words = words.iter().filter(|word| *word != "--bench");
@@ -65,10 +72,11 @@ impl Asked {
                 "--methods" => asked.methods = value.split(',').map(str::to_owned).collect(),
                 "--cache" => asked.cache = Some(value.into()),
                 "--motion" => asked.motion = toml::from_str(value).map_err(|error| error.to_string())?,
+                "--plot" => asked.plot = Some(value.into()),
                 "--csv" => asked.csv = Some(value.into()),
                 _ => {
                     return Err(format!(
-                        "{word} is not known: --flights --steps --threads --width --methods --cache --csv --motion"
+                        "{word} is not known: --flights --steps --threads --width --methods --cache --csv --plot --motion"
                     ));
                 }
             }
@@ -124,6 +132,9 @@ fn run() -> Result<(), String> {
         rows.sort_by_key(|row| row.plan.number);
         println!("{}", tables::report(name, rows));
         lines += &tables::csv(name, rows);
+    }
+    if let (Some(path), Some(rows)) = (&asked.plot, rows.first()) {
+        plot::draw(path, rows).map_err(|error| format!("{}: {error}", path.display()))?;
     }
     if let Some(path) = &asked.csv {
         std::fs::write(path, lines).map_err(|error| format!("{}: {error}", path.display()))?;

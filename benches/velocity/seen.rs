@@ -15,7 +15,10 @@ use nightflow::{
 };
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
-use super::flights::{Flown, Plan, Sensors, fly};
+use super::{
+    flights::{Flown, Plan, Sensors, fly},
+    opencv::{METHODS, OpenCv},
+};
 
 /// Stamps of one flight at one exposure lie this far from those of the next, so that no features are taken for others'.
 const APART_NS: i64 = 100_000_000_000;
@@ -120,7 +123,10 @@ impl<'a> Taken<'a> {
         let config = settings(name);
         let matcher = match matcher {
             Some(matcher) => matcher,
-            None => matcher.insert(Matcher::open(&config.flow).map_err(|error| error.to_string())?),
+            None => matcher.insert(match METHODS.contains(&name) {
+                true => Matcher::with(&config.flow, Box::new(OpenCv::open(name)?)),
+                false => Matcher::open(&config.flow).map_err(|error| error.to_string())?,
+            }),
         };
         let flown = self.flown()?;
         let mut seen = Seen::default();

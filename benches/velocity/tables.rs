@@ -6,7 +6,7 @@ use nalgebra::{Matrix6, Vector3, Vector6};
 use nightflow::{
     camera::Sample,
     darkness::ladder::MEANS,
-    motion::{Config, Odometer, Velocity},
+    motion::{BOUND_M_S, BOUND_PART, Config, Odometer, Velocity},
 };
 
 use super::{
@@ -15,7 +15,7 @@ use super::{
 };
 
 /// The bound that quality is about: metres a second, and a part of the speed.
-pub const BOUND: [f64; 2] = [0.1, 0.05];
+pub const BOUND: [f64; 2] = [BOUND_M_S, BOUND_PART];
 /// Groups of flights that stand for seeds.
 const SEEDS: u64 = 5;
 const BINS: usize = 8;
@@ -219,6 +219,13 @@ fn honesty(text: &mut String, rows: &[Row]) {
             if published.is_empty() { "–".into() } else { format!("{told:.2} ± {told_error:.2}") },
         );
     }
+}
+
+/// Mean normalised error squared of the linear velocity over its three degrees of freedom, and how far it may be off.
+pub fn nees(rows: &[Row], rung: usize) -> (f64, f64) {
+    let here = rows.iter().filter(|row| row.rung == rung);
+    let linear: Vec<_> = here.filter_map(|row| Some((row.plan.number, row.found.as_ref()?.nees[0] / 3.0))).collect();
+    mean(&linear)
 }
 
 /// Whether the velocity is within the bound that quality is about.
