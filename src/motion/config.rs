@@ -142,7 +142,7 @@ impl Default for Config {
             inlier_part_min: 0.25,
             seed_rad: 0.004,
             agree_rad_max: 0.015,
-            flow_shared_sd_cells: 0.012,
+            flow_shared_sd_cells: 0.01,
             flow_shared_sd_part: 0.005,
             clock_offset_s_max: 0.002,
             turn_scale_off_max: 0.02,
@@ -187,7 +187,7 @@ pub const REASONS: &[(&str, &str)] = &[
     ("agree_rad_max", "beyond six such pixels nothing is noise, whatever the spread of the rest"),
     (
         "flow_shared_sd_cells",
-        "0.05 network pixels: what residuals can't show, for the fit takes it for motion (cargo bench --bench velocity)",
+        "0.04 network pixels: what residuals can't show, for the fit takes it for motion (cargo bench --bench velocity)",
     ),
     ("flow_shared_sd_part", "the same bench, where the displacement is long"),
     ("clock_offset_s_max", "at 1 rad/s² it turns 2 mrad/s that nobody made; twice what gyro_offset_sd_s counts with"),

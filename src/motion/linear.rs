@@ -46,8 +46,12 @@ impl Fit {
             stretch += sight.stretch * sight.stretch;
             count += 1.0;
         }
-        let likeness = self.likeness();
-        noise *= likeness * count / f64::max(count - 0.5 * D as f64, 1.0);
+        // Of twice as many equations as there are independent vectors the fit used up D. A fit follows what is smooth:
+        // the residuals are smaller by that part, and the sums of their correlations along columns and rows too.
+        let apparent = self.likeness();
+        let independent = count / apparent;
+        let likeness = apparent * (independent / f64::max(independent - 0.5 * D as f64, 1.0)).powi(3);
+        noise *= likeness;
         if let Some(sd) = lean_sd {
             let prior = likeness * (spread / sd).powi(2);
             for axis in 3..D {
