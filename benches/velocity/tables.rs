@@ -6,7 +6,7 @@ use nalgebra::{Matrix6, Vector3, Vector6};
 use nightflow::{
     camera::Sample,
     darkness::ladder::MEANS,
-    motion::{BOUND_M_S, BOUND_PART, Config, Odometer, Velocity},
+    motion::{BOUND_M_S, BOUND_PART, Config, Drift, Odometer, Velocity},
 };
 
 use super::{
@@ -29,6 +29,8 @@ pub struct Row {
     pub noise_level: f32,
     pub truth: Vector3<f64>,
     pub found: Option<Found>,
+    /// What gyro and camera disagree on so far.
+    pub drift: Option<Drift>,
 }
 
 #[derive(Debug, Clone)]
@@ -71,7 +73,7 @@ pub fn judge(sensors: &Sensors, seen: &Seen, config: &Config) -> Result<Vec<Row>
             }
             let size = sensors.plan.size.map(|side| side as u32);
             let velocity = odometer.velocity(&step.flow(older, newer), size).ok();
-            rows.push(row(sensors, rung, before + 1, step, velocity));
+            rows.push(Row { drift: odometer.drift(), ..row(sensors, rung, before + 1, step, velocity) });
         }
     }
     Ok(rows)
@@ -89,7 +91,7 @@ fn row(sensors: &Sensors, rung: usize, newer: usize, step: &Step, velocity: Opti
         let nees = [(error.transpose() * linear * error)[0], (both.transpose() * all * both)[0]];
         Found { velocity, error, nees }
     });
-    Row { plan: sensors.plan, rung, blind: step.blind, noise_level: step.noise_level, truth, found }
+    Row { plan: sensors.plan, rung, blind: step.blind, noise_level: step.noise_level, truth, found, drift: None }
 }
 
 /// Mean, and how far it may be off: flights are independent, the steps of one are not.
@@ -134,7 +136,29 @@ pub fn report(name: &str, rows: &[Row]) -> String {
     hovering(&mut text, rows);
     honesty(&mut text, rows);
     quality(&mut text, rows);
+    watch(&mut text, rows);
     text
+}
+
+/// Shown where flights are long enough for the watch over clock and scale to speak; both are right but for the drawn
+/// error of the gyro's clock.
+fn watch(text: &mut String, rows: &[Row]) {
+    let last = rows.iter().zip(rows.iter().skip(1).map(Some).chain([None]));
+    let ends =
+        last.filter(|(row, next)| next.is_none_or(|next| (next.plan.number, next.rung) != (row.plan.number, row.rung)));
+    for (row, drift) in ends.filter_map(|(row, _)| Some((row, row.drift?))) {
+        let scale: Vec<String> = (0..3).map(|i| format!("{:.3} ± {:.3}", drift.scale[i], drift.scale_sd[i])).collect();
+        let _ = writeln!(
+            text,
+            "flight {} Exp-{}: gyro clock {:.2} ± {:.2} ms ahead, scale {}, said: {}",
+            row.plan.number,
+            row.rung,
+            1e3 * drift.offset_s,
+            1e3 * drift.offset_sd_s,
+            scale.join(", "),
+            drift.diagnosis(&Config::default()).map_or("nothing".into(), |said| said.to_string())
+        );
+    }
 }
 
 fn errors(text: &mut String, rows: &[Row]) {

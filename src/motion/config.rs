@@ -145,7 +145,7 @@ impl Default for Config {
             flow_shared_sd_cells: 0.01,
             flow_shared_sd_part: 0.005,
             clock_offset_s_max: 0.002,
-            turn_scale_off_max: 0.02,
+            turn_scale_off_max: 0.1,
             seed: 1,
         }
     }
@@ -191,6 +191,9 @@ pub const REASONS: &[(&str, &str)] = &[
     ),
     ("flow_shared_sd_part", "the same bench, where the displacement is long"),
     ("clock_offset_s_max", "at 1 rad/s² it turns 2 mrad/s that nobody made; twice what gyro_offset_sd_s counts with"),
-    ("turn_scale_off_max", "2 %: a focal length that is off by as much makes the velocity so too"),
+    (
+        "turn_scale_off_max",
+        "10 %: a hover that sways at 4 rad/s moves with its turns by as much at 6 m; a calibration that is off is more",
+    ),
     ("seed", "any number: what counts is that it stays the same"),
 ];

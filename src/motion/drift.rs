@@ -1,7 +1,7 @@
 //! Whether gyro and camera still agree while the body turns: the flow's scale and the gyro's clock, watched in flight.
 //!
-//! A fit that takes the gyro's turn off leaves a rest where the gyro says ρ more than the flow shows. The rest tells
-//! apart from motion over the ground by its shape alone, so that a body need not stand still to be watched. With θ
+//! A fit that takes the gyro's turn off leaves a rest where the gyro says ρ more than the flow shows: at all times about
+//! the optical axis, and about the other two where the body turns and does not move over the ground. With θ
 //! the turn that the gyro says and Δω the change of its rate over the interval, a flow that turns 1 + ε times as far, a
 //! gyro clock that is δ ahead and a bias β give −ρ = εθ + δΔω − βΔt. The steps of about half a minute are fitted by
 //! weighted least squares; that Δω is noisy too, by as much as the gyro's samples are, is taken out of its square.
@@ -24,7 +24,8 @@ const PRIOR_SD: [f64; 3] = [1.0, 0.1, 0.1];
 /// How the camera's turn compares with the gyro's, each with its standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Drift {
-    /// Turn by the flow over turn by the gyro, about the body's x, y and z (FLU).
+    /// Turn by the flow over turn by the gyro, about the body's x, y and z (FLU). A hover that sways slowly at a small
+    /// height moves with its turns, and shows that as a scale about x and y.
     pub scale: [f64; 3],
     /// Of each.
     pub scale_sd: [f64; 3],

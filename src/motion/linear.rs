@@ -12,6 +12,8 @@ pub(super) struct Leftover {
     pub(super) angle: Vector3<f64>,
     /// Inverse covariance, by the residuals.
     pub(super) information: Matrix3<f64>,
+    /// The same two where the camera is taken not to have moved.
+    pub(super) still: (Vector3<f64>, Matrix3<f64>),
 }
 
 impl Fit {
@@ -61,8 +63,13 @@ impl Fit {
         }
         let inverse = invert(&slope)?;
         let apart = turn_slope - by_turn.transpose() * inverse * by_turn;
-        let leftover = invert(&apart)
-            .map(|turn| Leftover { angle: turn * turn_pull, information: apart / (likeness * spread * spread) });
+        let moved = by_turn.fixed_view::<3, 3>(0, 0).transpose() * motion.tau;
+        let variance = likeness * spread * spread;
+        let leftover = invert(&apart).zip(invert(&turn_slope)).map(|(moving, still)| Leftover {
+            angle: moving * turn_pull,
+            information: apart / variance,
+            still: (still * (turn_pull + moved), turn_slope / variance),
+        });
         let found = inverse * noise * inverse.transpose();
         let (by_turn, by_shift, by_normal) = (inverse * by_turn, inverse * by_shift, inverse * by_normal);
         let given = lean_sd.is_none();

@@ -21,6 +21,11 @@ use crate::{
 /// (rad/s)² of a body rate that nothing observed.
 const UNOBSERVED: f64 = 1e6;
 
+/// The body as good as stands still where it turns across the optical axis by more than this, radians, …
+const STILL_TURN_MIN: f64 = 3e-3;
+/// … and what the gyro leaves of the flow is less than this part of that turn.
+const STILL_PART: f64 = 0.3;
+
 /// Velocity from flow over the ground. It allocates nothing after its first step.
 #[derive(Debug)]
 pub struct Odometer {
@@ -228,13 +233,27 @@ impl Odometer {
     }
 
     /// Keeps what the flow shows of the turn beside what the gyro says.
+    ///
+    /// A turn about the optical axis looks like no motion over the ground. A turn across it differs from a shift by its
+    /// curvature alone, which networks smooth away; it is compared only where the body as good as stands still.
     fn compare(&mut self, turn: &Turn, found: &Found, span: Span) {
         let (Some(leftover), Some(swing_variance)) = (found.leftover, turn.swing_variance) else { return };
         let mount = self.mount.matrix();
+        let axis: Vector3<f64> = mount.column(2).into();
+        let across = |angle: &Vector3<f64>| (angle - axis * axis.dot(angle)).norm();
+        let angle = turn.mean * span.seconds;
+        let still = mount * leftover.still.0;
+        let (leftover, information) = if across(&angle) > STILL_TURN_MIN && across(&still) < STILL_PART * across(&angle)
+        {
+            (still, mount * leftover.still.1 * mount.transpose())
+        } else {
+            let Some(covariance) = leftover.information.try_inverse() else { return };
+            (axis * leftover.angle.z, axis * axis.transpose() / covariance[(2, 2)])
+        };
         self.watch.take(&Turned {
-            leftover: mount * leftover.angle,
-            information: mount * leftover.information * mount.transpose(),
-            angle: turn.mean * span.seconds,
+            leftover,
+            information,
+            angle,
             swing: turn.last - turn.first,
             swing_variance,
             interval_s: span.seconds,
