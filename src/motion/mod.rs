@@ -52,7 +52,7 @@ pub struct Velocity {
     pub inliers: u32,
     /// 255 × the probability that `linear` is within [`BOUND_M_S`] + [`BOUND_PART`] of the speed of the truth (length of
     /// the error in all three directions; [`BOUND_PER_S`] where it is per distance). It follows from the covariance,
-    /// means the same by day and by night, and is held against simulated flights by `benches/velocity`.
+    /// means the same by day and by night; its curve on simulated flights is in `models/velocity.md`.
     pub quality: u8,
 }
 
