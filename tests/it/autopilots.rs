@@ -262,6 +262,35 @@ fn a_serial_line_carries_flow_heartbeats_and_the_clock() {
 }
 
 #[test]
+fn a_line_that_was_lost_is_opened_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("line");
+    let (peer, place) = autopilot("serial");
+    std::os::unix::fs::symlink(place, &path).unwrap();
+    let serial = Serial { path: path.clone(), baud: 57_600 };
+    let mut sink = mavlink::open(&Mavlink { link: Link::Serial(serial), ..Mavlink::default() }).unwrap();
+    peer.kill();
+    let (mut peer, place) = autopilot("serial");
+    fs::remove_file(&path).unwrap();
+    std::os::unix::fs::symlink(place, &path).unwrap();
+    let begun = Instant::now();
+    let mut step = 0;
+    let line = loop {
+        offer(&mut sink, &moved(step, Stamp(1_000_000_000_000 + step as i64 * STEP_NS), &fly(1.0, 0.0, 0.0), false));
+        step += 1;
+        match peer.line_within(Duration::from_millis(50)) {
+            Some(line) if line.contains("OPTICAL_FLOW_RAD") => break line,
+            _ => assert!(begun.elapsed() < LONG, "the line was not opened again"),
+        }
+    };
+    let flow: Value = serde_json::from_str(&line).unwrap();
+    close(number(&flow, "integrated_y"), expected(&table()[0])[1], 3e-6, "forward");
+    sink.finish().unwrap();
+    assert!((1..step).contains(&sink.lost()), "{} of {step} steps are counted as lost", sink.lost());
+    peer.finish(LONG);
+}
+
+#[test]
 fn cyclonedds_reads_what_px4_takes() {
     let (domain, namespace) = ros2::place();
     let mut peer = peers::spawn("px4_read.py", [domain.to_string(), namespace.clone()]);
