@@ -1,14 +1,18 @@
 //! The laboratory of the paper: noise models, synthetic flights and darkness, and evaluation.
 
 pub mod bound;
+mod contact;
+pub mod course;
 mod curves;
 pub mod datasets;
 pub mod enhance;
+mod eye;
 pub mod fcdn;
 pub mod flight;
 pub mod flow_files;
 pub mod foi;
 pub mod gaussians;
+mod instruments;
 pub mod ladder;
 pub mod level;
 pub mod methods;

@@ -4,15 +4,18 @@ use nalgebra::{UnitQuaternion, Vector3};
 
 use super::noise::Normals;
 
+/// m/s².
+const GRAVITY: f64 = 9.806_65;
+
 /// A sum of two sines with its derivatives.
 #[derive(Debug, Clone, Copy)]
-struct Sway {
+pub(super) struct Sway {
     waves: [[f64; 3]; 2],
 }
 
 impl Sway {
     /// Amplitude of the whole, and a period in seconds around which the two waves lie.
-    fn draw(amplitude: f64, period: f64, draws: &mut Normals) -> Self {
+    pub(super) fn draw(amplitude: f64, period: f64, draws: &mut Normals) -> Self {
         let mut wave = |part: f64, period: f64| {
             let omega = std::f64::consts::TAU / (period * (0.8 + 0.4 * draws.uniform()));
             [amplitude * part, omega, std::f64::consts::TAU * draws.uniform()]
@@ -21,7 +24,7 @@ impl Sway {
     }
 
     /// Value, first and second derivative.
-    fn at(&self, t: f64) -> [f64; 3] {
+    pub(super) fn at(&self, t: f64) -> [f64; 3] {
         self.waves.iter().fold([0.0; 3], |[v, d, dd], [amplitude, omega, phase]| {
             let (sine, cosine) = (omega * t + phase).sin_cos();
             [v + amplitude * sine, d + amplitude * omega * cosine, dd - amplitude * omega * omega * sine]
@@ -81,15 +84,27 @@ impl Path {
         let ([x, dx, ddx], [y, dy, ddy], [z, dz, ddz]) = (self.along.at(t), self.across.at(t), self.up.at(t));
         let ([roll, droll, _], [pitch, dpitch, _], [yaw, dyaw, _]) =
             (self.roll.at(t), self.pitch.at(t), self.yaw.at(t));
+        Pose::new(
+            [Vector3::new(self.speed * t + x, y, self.height + z), Vector3::new(self.speed + dx, dy, dz)],
+            Vector3::new(ddx, ddy, ddz),
+            [[roll, droll], [pitch, dpitch], [yaw, dyaw]],
+        )
+    }
+}
+
+impl Pose {
+    /// From position and velocity, acceleration (m, m/s and m/s², world), and roll, pitch and yaw with their derivatives.
+    pub(super) fn new(motion: [Vector3<f64>; 2], acceleration: Vector3<f64>, angles: [[f64; 2]; 3]) -> Pose {
+        let ([position, velocity], [[roll, droll], [pitch, dpitch], [yaw, dyaw]]) = (motion, angles);
         let attitude = UnitQuaternion::from_euler_angles(roll, pitch, yaw);
         let (sr, cr) = roll.sin_cos();
         let (sp, cp) = pitch.sin_cos();
         Pose {
-            position: Vector3::new(self.speed * t + x, y, self.height + z),
+            position,
             attitude,
-            velocity: attitude.inverse() * Vector3::new(self.speed + dx, dy, dz),
+            velocity: attitude.inverse() * velocity,
             rates: Vector3::new(droll - dyaw * sp, dpitch * cr + dyaw * sr * cp, dyaw * cr * cp - dpitch * sr),
-            force: attitude.inverse() * Vector3::new(ddx, ddy, ddz + 9.806_65),
+            force: attitude.inverse() * (acceleration + Vector3::z() * GRAVITY),
         }
     }
 }

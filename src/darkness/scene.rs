@@ -1,6 +1,6 @@
 //! A level ground with boxes and poles on it, and what a ray meets there.
 
-use nalgebra::Vector3;
+use nalgebra::{UnitQuaternion, Vector3};
 
 use super::{
     noise::Normals,
@@ -12,13 +12,18 @@ use super::{
 pub(super) struct Scene {
     surface: Surface,
     blocks: Vec<Block>,
+    /// Whether the ground is looked at so slantingly that a pixel covers far more of it along the view than across.
+    slanting: bool,
 }
 
-/// A box that stands on the ground, with its sides along the world's axes.
+/// A box with its sides along the world's axes.
 #[derive(Debug, Clone, Copy)]
-struct Block {
-    low: Vector3<f64>,
-    high: Vector3<f64>,
+pub(super) struct Block {
+    /// Where it stands now.
+    pub(super) low: Vector3<f64>,
+    pub(super) high: Vector3<f64>,
+    /// From where it stood at first: what is on its faces moves with it.
+    pub(super) moved: Vector3<f64>,
 }
 
 /// Where a ray ends.
@@ -27,7 +32,7 @@ pub(super) struct Hit {
     /// Along the ray, in lengths of its direction.
     pub(super) reach: f64,
     /// The block and the axis of its face; the ground has none.
-    block: Option<(usize, usize)>,
+    pub(super) block: Option<(usize, usize)>,
 }
 
 /// Columns and rows (first, last) of the image that a block may cover.
@@ -52,9 +57,29 @@ impl Scene {
             let y = side * (clear + height * (0.5 * wide + 0.55 * draws.uniform()));
             let half = Vector3::new(0.5 * long, 0.5 * wide, 0.0) * height;
             let foot = Vector3::new(x, y, 0.0);
-            blocks.push(Block { low: foot - half, high: foot + half + Vector3::z() * (tall * height) });
+            blocks.push(Block::new(foot - half, foot + half + Vector3::z() * (tall * height)));
         }
-        Self { surface: Surface::new(seed), blocks }
+        Self { surface: Surface::new(seed), blocks, slanting: false }
+    }
+
+    /// A ground that is looked at up to its horizon, with these blocks on and over it.
+    pub(super) fn with(seed: u64, blocks: Vec<Block>) -> Self {
+        Self { surface: Surface::new(seed), blocks, slanting: true }
+    }
+
+    /// The blocks as they stand.
+    pub(super) fn blocks(&self) -> &[Block] {
+        &self.blocks
+    }
+
+    /// How far what a ray hit has moved.
+    pub(super) fn moved(&self, hit: Hit) -> Vector3<f64> {
+        hit.block.and_then(|(index, _)| self.blocks.get(index)).map_or_else(Vector3::zeros, |block| block.moved)
+    }
+
+    /// How far the ground, or what stands on it, is along the down axis of a body.
+    pub(super) fn below(&self, position: &Vector3<f64>, attitude: &UnitQuaternion<f64>) -> Option<f64> {
+        self.cast(position, &(attitude * -Vector3::z()), [0.0; 2], &[]).map(|hit| hit.reach)
     }
 
     /// The corners of each block, for [`Bounds`].
@@ -95,7 +120,15 @@ impl Scene {
     pub(super) fn shade(&self, from: &Vector3<f64>, ray: &Vector3<f64>, hit: Hit, angle: f64) -> Albedo {
         let point = from + ray * hit.reach;
         let footprint = angle * hit.reach;
-        let Some((index, axis)) = hit.block else { return self.surface.ground(point.x, point.y, footprint) };
+        let Some((index, axis)) = hit.block else {
+            if !self.slanting {
+                return self.surface.ground(point.x, point.y, footprint);
+            }
+            // Along the view a pixel covers reach over height times as much, and two rays a pixel sample that.
+            let along = 0.5 * footprint / ray.z.abs().max(1e-9);
+            return self.surface.far_ground(point.x, point.y, footprint.max(along));
+        };
+        let point = point - self.blocks[index].moved;
         let face = (index * 4 + axis + 1) as u32;
         let (u, v) = match axis {
             0 => (point.y, point.z),
@@ -109,6 +142,16 @@ impl Scene {
 }
 
 impl Block {
+    /// A block between two corners.
+    pub(super) fn new(low: Vector3<f64>, high: Vector3<f64>) -> Block {
+        Block { low, high, moved: Vector3::zeros() }
+    }
+
+    /// The block after it moved by so much.
+    pub(super) fn shifted(self, by: Vector3<f64>) -> Block {
+        Block { low: self.low + by, high: self.high + by, moved: self.moved + by }
+    }
+
     /// Where the ray enters, and through the faces of which axis.
     fn enter(&self, from: &Vector3<f64>, ray: &Vector3<f64>) -> Option<(f64, usize)> {
         let (mut near, mut far, mut through) = (0.0_f64, f64::INFINITY, 2);

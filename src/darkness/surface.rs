@@ -27,11 +27,26 @@ impl Surface {
     /// The ground at (x, y) metres, for a pixel that covers `footprint` metres of it: what is finer is left out, so that
     /// nothing aliases.
     pub(super) fn ground(&self, x: f64, y: f64, footprint: f64) -> Albedo {
-        let meadow = smooth((self.octave(x, y, 5.0, 91) - 0.42) * 6.0);
-        let track = smooth((self.octave(x, y, 2.2, 92) - 0.58) * 8.0);
+        self.land(x, y, footprint, |_| 1.0)
+    }
+
+    /// The same up to the horizon, where a pixel covers whole stones and meadows too.
+    pub(super) fn far_ground(&self, x: f64, y: f64, footprint: f64) -> Albedo {
+        self.land(x, y, footprint, |length| fades(length, footprint))
+    }
+
+    /// `shown` says how much is shown of what is so many metres long.
+    fn land(&self, x: f64, y: f64, footprint: f64, shown: impl Fn(f64) -> f64) -> Albedo {
+        let patches = |noise: f64, steep: f64, length: f64| {
+            // What is no longer told apart is taken as half of each.
+            let shown = shown(length);
+            smooth(noise * steep) * shown + 0.5 * (1.0 - shown)
+        };
+        let meadow = patches(self.octave(x, y, 5.0, 91) - 0.42, 6.0, 5.0);
+        let track = patches(self.octave(x, y, 2.2, 92) - 0.58, 8.0, 2.2);
         let mut albedo = mix(mix(SOIL, GRASS, meadow), GRAVEL, track);
         let (shade, cover) = self.stone(x, y, footprint);
-        albedo = mix(albedo, [shade, shade, shade * 0.95], cover);
+        albedo = mix(albedo, [shade, shade, shade * 0.95], cover * shown(STONE_M));
         let light = 1.0 + 1.1 * self.detail(x, y, footprint, 0);
         albedo.map(|a| (a * light).clamp(0.02, 0.95))
     }
@@ -49,8 +64,7 @@ impl Surface {
         let mut sum = 0.0;
         for k in 0..OCTAVES {
             let length = LONGEST_M / f64::from(1 << k);
-            // An octave fades out from four pixels a wavelength down to two.
-            let visible = ((length / footprint - 2.0) / 2.0).clamp(0.0, 1.0);
+            let visible = fades(length, footprint);
             if visible == 0.0 {
                 break;
             }
@@ -87,6 +101,11 @@ impl Surface {
         let cover = ((radius - (x - cx).hypot(y - cy)) / footprint.max(1e-3) + 0.5).clamp(0.0, 1.0);
         (0.08 + 0.75 * draw(4), cover)
     }
+}
+
+/// How much is shown of a wavelength: it fades out from four pixels a wavelength down to two.
+fn fades(length: f64, footprint: f64) -> f64 {
+    ((length / footprint - 2.0) / 2.0).clamp(0.0, 1.0)
 }
 
 /// A value in [0, 1) for a lattice point.

@@ -4,7 +4,8 @@ use nalgebra::Vector3;
 use nightflow::{
     camera::Sample,
     darkness::{
-        flight::{self, Flight, Settings, Shot},
+        course::{self, Course, Thing},
+        flight::{self, Flight, Settings, Shot, TrueFlow},
         noise::{Noise, Normals},
         pan::{self, Pan, Photograph},
         profiles,
@@ -87,8 +88,8 @@ fn profiles_are_found_and_never_negative() {
     assert!(iso.contains("3201") && iso.contains("3200"), "{iso}");
 }
 
-fn frame(shot: &Shot) -> &Image {
-    let Some(Sample::Frame(frame)) = shot.samples.last() else { panic!("the frame comes last") };
+fn frame(samples: &[Sample]) -> &Image {
+    let Some(Sample::Frame(frame)) = samples.last() else { panic!("the frame comes last") };
     &frame.image
 }
 
@@ -126,10 +127,9 @@ fn sample(grey: &[f64], columns: usize, rows: usize, x: f64, y: f64) -> Option<f
 
 /// Mean squared difference at the flow's cells between the older frame and the newer one fetched along `shift` (camera
 /// pixels added to the true flow) or, without flow, at the same place.
-fn residual(older: &Image, newer: &Shot, flowing: f64, shift: [f64; 2]) -> f64 {
-    let flow = newer.truth.flow.as_ref().unwrap();
+fn residual(older: &Image, newer: &Image, flow: &TrueFlow, flowing: f64, shift: [f64; 2]) -> f64 {
     let (then, columns, rows) = cells(older);
-    let (now, ..) = cells(frame(newer));
+    let (now, ..) = cells(newer);
     let mut differences = Vec::new();
     for cell in 0..flow.grid.cells() {
         let [u, v] = [0, 1].map(|axis| flowing * f64::from(flow.vectors[2 * cell + axis]) + shift[axis]);
@@ -163,19 +163,45 @@ fn the_true_flow_carries_one_frame_onto_the_other() {
         let shots: Vec<Shot> = Flight::new(settings).unwrap().collect();
         assert_eq!(shots.len(), 7);
         for pair in shots.windows(2) {
-            let older = frame(&pair[0]);
-            let right = residual(older, &pair[1], 1.0, [0.0; 2]);
-            let still = residual(older, &pair[1], 0.0, [0.0; 2]);
-            assert!(right < 0.05 * still, "seed {seed}: true flow leaves {right:e}, no flow {still:e}");
-            for shift in [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]] {
-                let off = residual(older, &pair[1], 1.0, shift);
-                assert!(
-                    right < 0.8 * off,
-                    "seed {seed}: half a cell off by {shift:?} leaves {off:e}, the truth {right:e}"
-                );
-            }
+            let [older, newer] = [0, 1].map(|i| frame(&pair[i].samples));
+            carries(older, newer, pair[1].truth.flow.as_ref().unwrap(), &format!("seed {seed}"));
         }
     }
+}
+
+/// The true flow explains the pair, and neither no flow nor one that is half a cell off does.
+fn carries(older: &Image, newer: &Image, flow: &TrueFlow, name: &str) {
+    let right = residual(older, newer, flow, 1.0, [0.0; 2]);
+    let still = residual(older, newer, flow, 0.0, [0.0; 2]);
+    assert!(right < 0.05 * still, "{name}: true flow leaves {right:e}, no flow {still:e}");
+    for shift in [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]] {
+        let off = residual(older, newer, flow, 1.0, shift);
+        assert!(right < 0.8 * off, "{name}: half a cell off by {shift:?} leaves {off:e}, the truth {right:e}");
+    }
+}
+
+#[test]
+fn the_true_flow_of_a_course_carries_one_frame_onto_the_other() {
+    let crossing = Thing::pole(6.0, -1.5, 1.5).moving([0.0, 2.0, 0.0]);
+    let settings = course::Settings {
+        noise: None,
+        mean: 0.2,
+        size: [320, 240],
+        things: vec![Thing::wall(8.0), crossing],
+        ..course::Settings::default()
+    };
+    let mut course = Course::new(settings).unwrap();
+    let shots: Vec<course::Shot> = (0..5).map(|_| course.shot([0.0, 0.5, 0.0])).collect();
+    for pair in shots.windows(2) {
+        let [older, newer] = [0, 1].map(|i| frame(&pair[i].samples));
+        carries(older, newer, pair[1].truth.flow.as_ref().unwrap(), "course");
+    }
+    let samples: Vec<&Sample> = shots.iter().flat_map(|shot| &shot.samples).collect();
+    assert!(samples.windows(2).all(|pair| pair[0].stamp() <= pair[1].stamp()));
+    let count = |is: fn(&Sample) -> bool| samples.iter().filter(|sample| is(sample)).count();
+    // 100 ms of lead and four periods of a fifteenth of a second, both ends included.
+    assert_eq!(count(|s| matches!(s, Sample::Imu(_))), 74);
+    assert_eq!(count(|s| matches!(s, Sample::Range(_))), 15);
 }
 
 #[test]
@@ -187,7 +213,7 @@ fn the_light_falls_as_asked_and_noise_is_the_cameras() {
     let again: Vec<Shot> = Flight::new(settings).unwrap().collect();
     for (index, (shot, clean)) in noisy.iter().zip(&clean).enumerate() {
         let expected = 0.1 * (0.004_f64 / 0.1).powf(index as f64 / 3.0);
-        let (with, without) = (values(frame(shot)), values(frame(clean)));
+        let (with, without) = (values(frame(&shot.samples)), values(frame(&clean.samples)));
         let mean = without.iter().sum::<f64>() / without.len() as f64;
         assert!((mean / expected - 1.0).abs() < 0.25, "frame {index}: mean {mean}, asked for {expected}");
         let ratio: f64 = with
@@ -202,7 +228,7 @@ fn the_light_falls_as_asked_and_noise_is_the_cameras() {
             .sum::<f64>()
             / with.len() as f64;
         assert!((ratio - 1.0).abs() < 0.05, "frame {index}: noise is {ratio} of what the profile says");
-        assert_eq!(frame(shot), frame(&again[index]), "the same seed gives the same frame");
+        assert_eq!(frame(&shot.samples), frame(&again[index].samples), "the same seed gives the same frame");
     }
 }
 

@@ -6,6 +6,7 @@ use nightflow::{
     camera::{self, Next, Sample},
     clock::{Stamp, Untimed},
     config::Config,
+    darkness::flight::{Flight, Settings},
     flow::{Lender, Own},
     motion::Velocity,
     pipeline::{Outcome, Pipeline},
@@ -100,4 +101,25 @@ fn a_flight_into_the_dark_keeps_its_speed() {
     assert!(steps >= 100, "only {steps} steps have a velocity, {blind} have none");
     assert!(darkest < 0.006, "the flight ends at a raw mean of {darkest}");
     assert!(typical < 0.4, "the median error is {typical:.3} m/s");
+}
+
+#[test]
+fn the_recorded_flight_is_drawn_again_to_the_byte() {
+    let config = camera::Config {
+        source: camera::SourceConfig::Mcap(camera::Mcap { path: path("night_flight.mcap"), realtime: false }),
+        ..camera::Config::default()
+    };
+    let mut source = camera::open(&config).unwrap();
+    let flight = Flight::new(Settings { mean: [0.06, 0.004], ..Settings::default() }).unwrap();
+    let mut drawn: Vec<Sample> = flight.take(2).flat_map(|shot| shot.samples).collect();
+    let frames = drawn.iter().filter(|sample| matches!(sample, Sample::Frame(_))).count();
+    assert_eq!(frames, 2);
+    while !drawn.is_empty() {
+        let Next::Sample(sample) = source.next(Duration::from_millis(100)).unwrap() else { panic!("too short") };
+        let found = drawn.iter().position(|known| match (known, &sample) {
+            (Sample::Frame(known), Sample::Frame(read)) => known.image == read.image,
+            (known, read) => known == read,
+        });
+        drawn.remove(found.unwrap_or_else(|| panic!("the sample at {} was not drawn", sample.stamp())));
+    }
 }
