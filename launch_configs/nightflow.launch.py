@@ -14,6 +14,7 @@ HERE = Path(__file__).resolve().parent
 CONFIGS = [
     "px4_downward.toml",
     "ardupilot_downward.toml",
+    "forward_avoidance.toml",
     "replay.toml",
     "ros2.toml",
     "zenoh.toml",

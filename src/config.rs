@@ -95,6 +95,7 @@ const REASONS: &[(&str, &[(&str, &str)])] = &[
     ("exposure", exposure::REASONS),
     ("flow", flow::REASONS),
     ("motion", motion::REASONS),
+    ("motion", motion::obstacles::REASONS),
     ("publish", publish::REASONS),
     ("recording", recording::REASONS),
 ];
@@ -102,8 +103,8 @@ const REASONS: &[(&str, &[(&str, &str)])] = &[
 /// Why the value of `camera.image_topic` (say) is what it is.
 pub fn reason(key: &str) -> Option<&'static str> {
     let (section, rest) = key.split_once('.')?;
-    let (_, reasons) = REASONS.iter().find(|(name, _)| *name == section)?;
-    reasons.iter().find(|(name, _)| *name == rest).map(|(_, why)| *why)
+    let all = REASONS.iter().filter(|(name, _)| *name == section).flat_map(|(_, reasons)| *reasons);
+    all.into_iter().find(|(name, _)| *name == rest).map(|(_, why)| *why)
 }
 
 /// Of the names that the parser expected, the one nearest to the one that it found.

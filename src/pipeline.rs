@@ -8,7 +8,7 @@ use crate::{
     config::Config,
     exposure::{self, Developer, Exposed},
     flow::{self, Lender, Matcher, Resolution, State},
-    motion::{self, Diagnosis, Lack, Odometer},
+    motion::{self, Diagnosis, Lack, Lookout, NoSight, Odometer},
     publish::Moved,
 };
 
@@ -17,6 +17,7 @@ pub struct Pipeline {
     exposure: Developer,
     flow: Matcher,
     motion: Odometer,
+    lookout: Option<Lookout>,
     gap_ms_max: f64,
     newest: Option<Stamp>,
     steps: u64,
@@ -87,6 +88,7 @@ impl Pipeline {
             exposure: Developer::new(&config.exposure)?,
             flow,
             motion: Odometer::new(&motion)?.exposing(config.camera.exposure_s),
+            lookout: motion.obstacles.as_ref().map(Lookout::new).transpose()?,
             gap_ms_max: config.flow.gap_ms_max,
             newest: None,
             steps: 0,
@@ -117,6 +119,11 @@ impl Pipeline {
             _ => self.motion.velocity(&flow, camera_size),
         };
         let integrated = self.motion.integrated(&flow, camera_size, matches!(state, State::Blind(_)));
+        let obstacles = match (&mut self.lookout, &state) {
+            (None, _) => Err(NoSight::Off),
+            (Some(_), State::Blind(_)) => Err(NoSight::Lack(Lack::Blind)),
+            (Some(lookout), _) => lookout.look(&self.motion, &flow, camera_size, pair.older, &velocity),
+        };
         laps.lap(Stage::Motion);
         let moved = Moved {
             step: self.steps,
@@ -134,6 +141,7 @@ impl Pipeline {
             state,
             velocity,
             integrated,
+            obstacles,
         };
         self.steps += 1;
         Ok(Outcome::Moved(moved))
@@ -156,6 +164,11 @@ impl Pipeline {
     /// The newest developed frame, for previews.
     pub fn image(&self) -> Option<&Exposed> {
         self.exposure.newest()
+    }
+
+    /// What looks for obstacles, where it is asked to.
+    pub fn lookout(&self) -> Option<&Lookout> {
+        self.lookout.as_ref()
     }
 
     /// What camera and gyro disagree on, if they do beyond doubt.

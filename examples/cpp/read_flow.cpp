@@ -55,6 +55,30 @@ struct VelocitySample {
 };
 static_assert(sizeof(VelocitySample) == 408);
 
+// Field by field as nightflow::publish::shared::ObstaclesSample; where nothing is known valid is 0.
+struct ObstaclesSample {
+    static constexpr const char* IOX2_TYPE_NAME = "nightflow::ObstaclesSample";
+
+    std::int64_t older_ns;
+    std::int64_t newer_ns;
+    std::int64_t published_ns;
+    std::uint64_t step;
+    double heading[3]; // level body frame, unit length
+    double heading_sd;
+    double speed; // m/s, NaN when not metric
+    double horizon_s;
+    double delay_s;
+    std::uint32_t valid;
+    std::uint32_t state;
+    std::uint32_t cause;
+    std::uint32_t sight; // 0 seen, below 64 as lack, 64 not asked for, 65 bare, 66 no parallax
+    float ttc_s[72];     // sector k looks along -pi + k 2 pi / 72, counter-clockwise; 36 looks forward
+    float distance_m[72];
+    float confidence[72];
+    std::uint8_t sector[72]; // 0 unknown, 1 free, 2 occupied
+};
+static_assert(sizeof(ObstaclesSample) == 1040);
+
 auto main(int argc, char** argv) -> int {
     using namespace iox2;
     set_log_level_from_env_or(LogLevel::Error);
@@ -77,6 +101,14 @@ auto main(int argc, char** argv) -> int {
                         .create()
                         .value();
 
+    auto obstacles = node.service_builder(ServiceName::create((prefix + "/obstacles").c_str()).value())
+                         .publish_subscribe<ObstaclesSample>()
+                         .open()
+                         .value()
+                         .subscriber_builder()
+                         .create()
+                         .value();
+
     // Looks every millisecond; to be woken instead, listen on the event service of the same name as the flow.
     while (node.wait(bb::Duration::from_millis(1)).has_value()) {
         for (auto sample = flow.receive().value(); sample.has_value(); sample = flow.receive().value()) {
@@ -95,6 +127,20 @@ auto main(int argc, char** argv) -> int {
             } else {
                 // Not standing still: nothing is known.
                 std::cout << "step " << found.step << ": no velocity" << std::endl;
+            }
+        }
+        for (auto sample = obstacles.receive().value(); sample.has_value(); sample = obstacles.receive().value()) {
+            const ObstaclesSample& found = sample->payload();
+            // Unknown is not free: a planner keeps out of both unknown and occupied sectors.
+            int nearest = -1;
+            for (int k = 0; k < 72; k++) {
+                if (found.sector[k] == 2 && (nearest < 0 || found.ttc_s[k] < found.ttc_s[nearest])) {
+                    nearest = k;
+                }
+            }
+            if (nearest >= 0) {
+                std::cout << "step " << found.step << ": sector " << nearest << " in " << found.ttc_s[nearest] << " s"
+                          << std::endl;
             }
         }
     }

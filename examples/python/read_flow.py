@@ -67,6 +67,34 @@ class VelocitySample(ctypes.Structure):
         return "nightflow::VelocitySample"
 
 
+class ObstaclesSample(ctypes.Structure):
+    """Field by field as `nightflow::publish::shared::ObstaclesSample`; where nothing is known `valid` is 0."""
+
+    _fields_ = [
+        ("older_ns", ctypes.c_int64),
+        ("newer_ns", ctypes.c_int64),
+        ("published_ns", ctypes.c_int64),
+        ("step", ctypes.c_uint64),
+        ("heading", ctypes.c_double * 3),  # level body frame, unit length
+        ("heading_sd", ctypes.c_double),
+        ("speed", ctypes.c_double),  # m/s, NaN when not metric
+        ("horizon_s", ctypes.c_double),
+        ("delay_s", ctypes.c_double),
+        ("valid", ctypes.c_uint32),
+        ("state", ctypes.c_uint32),
+        ("cause", ctypes.c_uint32),
+        ("sight", ctypes.c_uint32),  # 0 seen, below 64 as lack, 64 not asked for, 65 bare, 66 no parallax
+        ("ttc_s", ctypes.c_float * 72),  # sector k looks along -pi + k 2 pi / 72, counter-clockwise
+        ("distance_m", ctypes.c_float * 72),
+        ("confidence", ctypes.c_float * 72),
+        ("sector", ctypes.c_uint8 * 72),  # 0 unknown, 1 free, 2 occupied
+    ]
+
+    @staticmethod
+    def type_name():
+        return "nightflow::ObstaclesSample"
+
+
 def floats(sample):
     """The payload as a NumPy array over the shared memory itself; it holds until `sample.delete()`.
 
@@ -83,12 +111,17 @@ def open_floats(node, name):
     return service.subscriber_builder().create()
 
 
+def open_plain(node, name, kind):
+    service = node.service_builder(iox.ServiceName.new(name))
+    return service.publish_subscribe(kind).open().subscriber_builder().create()
+
+
 def main(prefix="nightflow", steps="0"):
     iox.set_log_level_from_env_or(iox.LogLevel.Error)
     node = iox.NodeBuilder.new().create(iox.ServiceType.Ipc)
     flow, confidence = open_floats(node, f"{prefix}/flow"), open_floats(node, f"{prefix}/confidence")
-    velocity = node.service_builder(iox.ServiceName.new(f"{prefix}/velocity"))
-    velocity = velocity.publish_subscribe(VelocitySample).open().subscriber_builder().create()
+    velocity = open_plain(node, f"{prefix}/velocity", VelocitySample)
+    obstacles = open_plain(node, f"{prefix}/obstacles", ObstaclesSample)
     wake = node.service_builder(iox.ServiceName.new(f"{prefix}/flow")).event().open().listener_builder().create()
     print("reading", flush=True)
 
@@ -107,6 +140,7 @@ def main(prefix="nightflow", steps="0"):
             sample.delete()
             show_confidence(confidence, step)
             show_velocity(velocity, step)
+            show_obstacles(obstacles, step)
             seen += 1
 
 
@@ -128,6 +162,28 @@ def show_velocity(velocity, step):
             # No velocity is not standing still: nothing is known.
             numbers = " ".join(f"{x:.4f}" for x in found.linear) if found.valid else "none"
             print(f"velocity {step} {numbers} covariance {found.covariance[35]:.4f} quality {found.quality}", flush=True)
+        reached = found.step >= step
+        sample.delete()
+        if reached:
+            return
+
+
+def show_obstacles(obstacles, step):
+    while (sample := obstacles.receive()) is not None:
+        found = sample.payload().contents
+        if found.step == step:
+            kinds = list(found.sector)
+            occupied = [k for k, kind in enumerate(kinds) if kind == 2]
+            # Unknown is not free: a planner keeps out of both unknown and occupied sectors.
+            if not found.valid:
+                said = "unknown"
+            elif occupied:
+                k = min(occupied, key=lambda k: found.ttc_s[k])
+                said = f"nearest sector {k} in {found.ttc_s[k]:.4f} s at {found.distance_m[k]:.4f} m,"
+                said += f" {kinds.count(1)} free, {kinds.count(0)} unknown"
+            else:
+                said = f"nothing near, {kinds.count(1)} free, {kinds.count(0)} unknown"
+            print(f"obstacles {step} {said}", flush=True)
         reached = found.step >= step
         sample.delete()
         if reached:

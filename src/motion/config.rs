@@ -74,6 +74,8 @@ pub struct Config {
     pub turn_scale_off_max: f64,
     /// Seed of the random draws.
     pub seed: u32,
+    /// Whether it is looked for what is in the way, and how; `None` (absent) looks for nothing.
+    pub obstacles: Option<super::obstacles::Config>,
 }
 
 /// How the camera's optical frame stands in the body.
@@ -147,6 +149,7 @@ impl Default for Config {
             clock_offset_s_max: 0.002,
             turn_scale_off_max: 0.1,
             seed: 1,
+            obstacles: None,
         }
     }
 }

@@ -14,12 +14,14 @@ mod gyro;
 mod integrated;
 mod lens;
 mod linear;
+pub mod obstacles;
 mod odometer;
 mod quality;
 
 pub use config::{AttitudeUse, Config, GyroUse, Mount, REASONS};
 pub use drift::{Diagnosis, Drift};
 pub use integrated::{Integrated, NoFlow};
+pub use obstacles::{Lookout, NoSight, Obstacles, SECTORS, Sector};
 pub use odometer::Odometer;
 pub use quality::{BOUND_M_S, BOUND_PART, BOUND_PER_S};
 

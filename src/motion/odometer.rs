@@ -10,6 +10,7 @@ use super::{
     gyro::{Rates, Turn},
     integrated::Below,
     lens::Lens,
+    obstacles::Sighting,
     quality,
 };
 use crate::{
@@ -149,15 +150,12 @@ impl Odometer {
 
     /// The body's velocity by the flow between two frames of `camera_size` (columns, rows).
     pub fn velocity(&mut self, flow: &Flow<'_>, camera_size: [u32; 2]) -> Result<Velocity, Lack> {
-        let lens = self.lens.as_ref().ok_or(Lack::Calibration)?;
-        if lens.size() != [0, 0] && lens.size() != camera_size {
-            return Err(Lack::CameraSize { calibrated: lens.size(), frame: camera_size });
-        }
+        let focal = self.lens(camera_size)?.focal();
         let span = self.span(flow);
         if span.seconds <= 0.0 {
             return Err(Lack::Degenerate);
         }
-        let constant = self.config.flow_shared_sd_cells * f64::from(flow.grid.scale[0]) / lens.focal();
+        let constant = self.config.flow_shared_sd_cells * f64::from(flow.grid.scale[0]) / focal;
         let turn = self.turn(span)?;
         let mut ground = self.ground(span);
         self.look(flow, &turn, &ground);
@@ -172,6 +170,31 @@ impl Odometer {
         }
         let velocity = self.conclude(&turn, &ground, &found, span, shared);
         Ok(Velocity { older: flow.older, newer: flow.newer, ..velocity })
+    }
+
+    /// The lens of frames of this size (columns, rows).
+    pub(super) fn lens(&self, camera_size: [u32; 2]) -> Result<&Lens, Lack> {
+        let lens = self.lens.as_ref().ok_or(Lack::Calibration)?;
+        if lens.size() != [0, 0] && lens.size() != camera_size {
+            return Err(Lack::CameraSize { calibrated: lens.size(), frame: camera_size });
+        }
+        Ok(lens)
+    }
+
+    /// How the body turned between two frames and where up is, for whoever looks for more than the ground.
+    pub(super) fn sighting(&self, flow: &Flow<'_>, camera_size: [u32; 2]) -> Result<Sighting, Lack> {
+        self.lens(camera_size)?;
+        let span = self.span(flow);
+        if span.seconds <= 0.0 {
+            return Err(Lack::Degenerate);
+        }
+        let turn = self.turn(span)?.rotation;
+        let stated = match self.config.attitude {
+            AttitudeUse::Imu => self.rates.up_at(span.newer, self.config.range_age_s_max),
+            AttitudeUse::Level | AttitudeUse::Fit => None,
+        };
+        let up = stated.map_or_else(Vector3::z, |(up, _)| up);
+        Ok(Sighting { mount: *self.mount.matrix(), turn, up, interval_s: span.seconds })
     }
 
     /// From the middle of the older exposure to the middle of the newer one.

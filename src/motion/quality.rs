@@ -37,7 +37,7 @@ fn within(covariance: &Matrix3<f64>, bound: f64) -> f64 {
 }
 
 /// The part of a standard normal that is below t (Abramowitz and Stegun 7.1.26, right to 2e-7).
-fn below(t: f64) -> f64 {
+pub(super) fn below(t: f64) -> f64 {
     const SERIES: [f64; 5] = [0.254_829_592, -0.284_496_736, 1.421_413_741, -1.453_152_027, 1.061_405_429];
     let x = t.abs() / SQRT_2;
     let k = 1.0 / (1.0 + 0.327_591_1 * x);

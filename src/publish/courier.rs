@@ -15,7 +15,7 @@ use super::{
 };
 use crate::{
     clock::Stamp,
-    wire::{DiagnosticArray, EgoMotion, Image, Status, Step, TwistWithCovarianceStamped},
+    wire::{DiagnosticArray, EgoMotion, Image, LaserScan, Status, Step, TwistWithCovarianceStamped},
 };
 
 /// Steps that may wait for the network: a quarter of a second at 30 Hz, for results older than that help nobody.
@@ -26,6 +26,7 @@ const STATUSES_MAX: usize = 4;
 pub(super) enum Message<'a> {
     Velocity(&'a TwistWithCovarianceStamped),
     EgoMotion(&'a EgoMotion),
+    Proximity(&'a LaserScan),
     Step(&'a Step),
     Status(&'a Status),
     Diagnostics(&'a DiagnosticArray),
@@ -43,6 +44,7 @@ pub(super) trait Network: Send + 'static {
 pub(super) struct Topics {
     pub(super) velocity: String,
     pub(super) ego_motion: String,
+    pub(super) proximity: String,
     pub(super) step: String,
     pub(super) status: String,
     pub(super) diagnostics: String,
@@ -57,6 +59,7 @@ impl Topics {
         Self {
             velocity: under("velocity"),
             ego_motion: under("ego_motion"),
+            proximity: under("proximity"),
             step: under("step"),
             status: under("status"),
             // ROS 2 gathers the diagnostics of all nodes on this topic.
@@ -94,6 +97,8 @@ struct Parcel {
     has_velocity: bool,
     motion: EgoMotion,
     has_motion: bool,
+    proximity: LaserScan,
+    has_proximity: bool,
     flow: Kept,
     has_flow: bool,
 }
@@ -151,6 +156,7 @@ impl Sink for Courier {
         outgoing::fill_step(moved, &mut parcel.step);
         parcel.has_velocity = outgoing::fill_twist(moved, &self.body_frame, &mut parcel.velocity);
         parcel.has_motion = outgoing::fill_ego_motion(moved, &self.body_frame, &mut parcel.motion);
+        parcel.has_proximity = outgoing::fill_proximity(moved, &self.body_frame, &mut parcel.proximity);
         parcel.has_flow = self.images.due(moved.newer);
         if parcel.has_flow {
             parcel.flow.keep(offer);
@@ -224,6 +230,9 @@ impl<N: Network> Round<N> {
         if parcel.has_velocity {
             network.send(Message::Velocity(&parcel.velocity))?;
         }
+        if parcel.has_proximity {
+            network.send(Message::Proximity(&parcel.proximity))?;
+        }
         if parcel.has_motion {
             network.send(Message::EgoMotion(&parcel.motion))?;
         }
@@ -281,7 +290,7 @@ mod tests {
     use crate::{
         exposure::Exposed,
         flow,
-        motion::{Integrated, Lack, NoFlow},
+        motion::{Integrated, Lack, NoFlow, NoSight},
         publish::Moved,
     };
 
@@ -349,6 +358,7 @@ mod tests {
             state: flow::State::Ok,
             velocity: Err(Lack::Gyro),
             integrated: Integrated::without(Stamp::from_ns(0), Stamp::from_ns(1), NoFlow::Blind),
+            obstacles: Err(NoSight::Off),
         }
     }
 }

@@ -14,7 +14,7 @@ use ::iceoryx2::{
 
 use super::{
     Config, Error, Iceoryx2, Moved, Offer, Sink,
-    shared::{FlowHeader, StatusSample, VelocitySample},
+    shared::{FlowHeader, ObstaclesSample, StatusSample, VelocitySample},
 };
 use crate::{
     clock,
@@ -41,7 +41,7 @@ pub const STATUS_EVENT: usize = 1;
 type Loan = SampleMut<Service, [f32], FlowHeader>;
 type Floats = Publisher<Service, [f32], FlowHeader>;
 
-/// Names the four services under a prefix: `<prefix>/flow` and so on.
+/// Names the five services under a prefix: `<prefix>/flow` and so on.
 pub fn service_name(prefix: &str, name: &str) -> Result<ServiceName, Error> {
     let full = format!("{}/{name}", prefix.trim_end_matches('/'));
     ServiceName::new(&full).map_err(|e| refused(format!("{full:?} can't be the name of a service: {e:?}")))
@@ -73,6 +73,7 @@ pub struct SharedSink {
     flow: Floats,
     confidence: Floats,
     velocity: Publisher<Service, VelocitySample, ()>,
+    obstacles: Publisher<Service, ObstaclesSample, ()>,
     status: Publisher<Service, StatusSample, ()>,
     wake: Notifier<Service>,
     _node: Node<Service>,
@@ -109,6 +110,7 @@ impl SharedSink {
         let flow = floats("flow", settings.cells_max * 2)?;
         let confidence = floats("confidence", settings.cells_max)?;
         let velocity = plain::<VelocitySample>(&node, settings, "velocity")?;
+        let obstacles = plain::<ObstaclesSample>(&node, settings, "obstacles")?;
         let status = plain::<StatusSample>(&node, settings, "status")?;
         let wake = node
             .service_builder(&service_name(&settings.prefix, "flow")?)
@@ -126,6 +128,7 @@ impl SharedSink {
             flow,
             confidence,
             velocity,
+            obstacles,
             status,
             wake,
             _node: node,
@@ -155,7 +158,7 @@ impl SharedSink {
     /// it finds all else of the step there; a step whose vectors can't be sent still tells its velocity.
     pub fn send(&mut self, moved: &Moved) -> Result<(), Error> {
         let header = self.header(moved);
-        let told = self.send_velocity(moved, header.published_ns);
+        let told = self.send_velocity(moved, header.published_ns).and(self.send_obstacles(moved, header.published_ns));
         let sent = self.send_lent(moved, &header).map_err(|reason| {
             self.lost += 1;
             Error::Lost { sink: "iceoryx2", what: format!("the flow of step {}", moved.step), reason }
@@ -193,6 +196,16 @@ impl SharedSink {
         self.velocity.send_copy(sample).map(|_| ()).map_err(|e| Error::Lost {
             sink: "iceoryx2",
             what: format!("the velocity of step {}", moved.step),
+            reason: format!("{e:?}"),
+        })
+    }
+
+    /// Sent with every step, so that a reader knows at once that nothing is known any more.
+    fn send_obstacles(&mut self, moved: &Moved, published_ns: i64) -> Result<(), Error> {
+        let sample = ObstaclesSample { published_ns, ..ObstaclesSample::from(moved) };
+        self.obstacles.send_copy(sample).map(|_| ()).map_err(|e| Error::Lost {
+            sink: "iceoryx2",
+            what: format!("the obstacles of step {}", moved.step),
             reason: format!("{e:?}"),
         })
     }

@@ -22,7 +22,7 @@ use crate::{
     camera::Sample,
     clock::Stamp,
     flow::{Flow, State},
-    motion::{Integrated, Lack, Velocity},
+    motion::{Integrated, Lack, NoSight, Obstacles, Velocity},
     wire,
 };
 
@@ -59,6 +59,8 @@ pub struct Moved {
     pub velocity: Result<Velocity, Lack>,
     /// The flow straight below in an autopilot's form.
     pub integrated: Integrated,
+    /// What is in the way, or why that is not known.
+    pub obstacles: Result<Obstacles, NoSight>,
 }
 
 /// One step as a sink sees it.

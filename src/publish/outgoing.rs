@@ -8,9 +8,9 @@ use super::{Moved, Offer};
 use crate::{
     clock::Stamp,
     flow::{Flow, Grid, State, wheel},
-    motion::{Scale, Velocity},
+    motion::{NoSight, Obstacles, SECTORS, Scale, Sector, Velocity},
     wire::{
-        DiagnosticArray, DiagnosticStatus, EgoMotion, Header, Image, KeyValue, Status, Step, Twist,
+        DiagnosticArray, DiagnosticStatus, EgoMotion, Header, Image, KeyValue, LaserScan, Status, Step, Twist,
         TwistWithCovariance, TwistWithCovarianceStamped, Vector3,
     },
 };
@@ -98,6 +98,44 @@ pub fn fill_ego_motion(moved: &Moved, body_frame: &str, message: &mut EgoMotion)
     message.samples = velocity.samples;
     message.inliers = velocity.inliers;
     message.quality = velocity.quality;
+    true
+}
+
+/// What is in the way as distances; none where it is not looked for. See [`fill_proximity`].
+pub fn proximity(moved: &Moved, body_frame: &str) -> Option<LaserScan> {
+    let mut message = LaserScan::default();
+    fill_proximity(moved, body_frame, &mut message).then_some(message)
+}
+
+/// [`proximity`] into a message that is kept; false when obstacles are not looked for.
+///
+/// The rays lie in the body frame with its roll and pitch taken off. A ray is NaN where nothing is known, +inf where
+/// nothing is met up to `range_max`, the way of one horizon at the present speed (REP 117), and the intensity is the
+/// probability of what is said. Without a metric speed there are no distances: every ray is unknown.
+pub fn fill_proximity(moved: &Moved, body_frame: &str, message: &mut LaserScan) -> bool {
+    let seen = match (&moved.state, &moved.obstacles) {
+        (_, Err(NoSight::Off)) => return false,
+        (State::Blind(_), _) | (_, Err(_)) => None,
+        (_, Ok(found)) => found.speed.map(|speed| (found, speed)),
+    };
+    fill_header(&mut message.header, moved.newer, body_frame);
+    let increment = std::f32::consts::TAU / SECTORS as f32;
+    message.angle_min = -std::f32::consts::PI;
+    message.angle_max = std::f32::consts::PI - increment;
+    message.angle_increment = increment;
+    (message.time_increment, message.range_min) = (0.0, 0.0);
+    message.scan_time = moved.newer.seconds_since(moved.older) as f32;
+    message.range_max = seen.map_or(0.0, |(found, speed)| (found.horizon_s * speed) as f32);
+    let sector = |k: usize| seen.map_or(Sector::Unknown, |(Obstacles { sectors, .. }, _)| sectors[k]);
+    let ray = |sector: Sector| match sector {
+        Sector::Unknown => (f32::NAN, 0.0),
+        Sector::Free { confidence } => (f32::INFINITY, confidence as f32),
+        Sector::Occupied { distance_m, confidence, .. } => (distance_m as f32, confidence as f32),
+    };
+    message.ranges.clear();
+    message.ranges.extend((0..SECTORS).map(|k| ray(sector(k)).0));
+    message.intensities.clear();
+    message.intensities.extend((0..SECTORS).map(|k| ray(sector(k)).1));
     true
 }
 
@@ -244,7 +282,7 @@ mod tests {
     use crate::{
         exposure::Exposed,
         flow::Cause,
-        motion::{Integrated, Lack, NoDistance, NoFlow},
+        motion::{Integrated, Lack, NoDistance, NoFlow, NoSight},
     };
 
     fn moved(state: State, scale: Scale) -> Moved {
@@ -275,6 +313,7 @@ mod tests {
                 quality: 200,
             }),
             integrated: Integrated::without(older, newer, NoFlow::Blind),
+            obstacles: Err(NoSight::Off),
         }
     }
 
@@ -311,6 +350,40 @@ mod tests {
         assert_eq!(Stamp::from(message.header.stamp), moved.newer);
         assert_eq!(message.twist.twist.linear, Vector3 { x: 1.0, y: -2.0, z: 0.5 });
         assert_eq!(message.twist.covariance[2][3], 15.0);
+    }
+
+    #[test]
+    fn proximity_tells_free_from_unknown_and_is_silent_where_nobody_asked() {
+        let mut moved = moved(State::Ok, METRIC);
+        assert_eq!(proximity(&moved, "base_link"), None);
+        moved.obstacles = Err(NoSight::Lack(Lack::Gyro));
+        let Some(unseen) = proximity(&moved, "base_link") else { panic!("no scan") };
+        assert!(unseen.ranges.len() == SECTORS && unseen.ranges.iter().all(|range| range.is_nan()), "{unseen:?}");
+        let mut sectors = [Sector::Unknown; SECTORS];
+        sectors[35] = Sector::Free { confidence: 0.95 };
+        sectors[36] = Sector::Occupied { ttc_s: 2.0, distance_m: 6.0, confidence: 0.99 };
+        let found = Obstacles {
+            older: moved.older,
+            newer: moved.newer,
+            sectors,
+            heading: [1.0, 0.0, 0.0],
+            heading_sd_rad: 0.01,
+            speed: Some(3.0),
+            horizon_s: 8.0,
+            delay_s: 0.15,
+        };
+        moved.obstacles = Ok(found);
+        let Some(scan) = proximity(&moved, "base_link") else { panic!("no scan") };
+        assert!(scan.ranges[34].is_nan() && scan.ranges[35] == f32::INFINITY && scan.ranges[36] == 6.0, "{scan:?}");
+        assert_eq!((scan.intensities[35], scan.intensities[36], scan.range_max), (0.95, 0.99, 24.0));
+        assert!((scan.angle_min + 36.0 * scan.angle_increment).abs() < 1e-5, "ray 36 looks forward");
+        moved.obstacles = Ok(Obstacles { speed: None, ..found });
+        let Some(unscaled) = proximity(&moved, "base_link") else { panic!("no scan") };
+        assert!(unscaled.ranges.iter().all(|range| range.is_nan()), "times without a speed are no distances");
+        moved.obstacles = Ok(found);
+        moved.state = State::Blind(DARK);
+        let Some(blind) = proximity(&moved, "base_link") else { panic!("no scan") };
+        assert!(blind.ranges.iter().all(|range| range.is_nan()));
     }
 
     #[test]

@@ -14,7 +14,7 @@ use super::{
 };
 use crate::{
     camera::ros2 as dds,
-    wire::{self, DiagnosticArray, EgoMotion, Image, Status, Step, TwistWithCovarianceStamped},
+    wire::{self, DiagnosticArray, EgoMotion, Image, LaserScan, Status, Step, TwistWithCovarianceStamped},
 };
 
 const NAME: &str = "ros2";
@@ -32,6 +32,7 @@ pub fn open(config: &Config, settings: &Ros2) -> Result<Courier, Error> {
 struct Dds {
     velocity: Publisher<TwistWithCovarianceStamped>,
     ego_motion: Publisher<EgoMotion>,
+    proximity: Publisher<LaserScan>,
     step: Publisher<Step>,
     status: Publisher<Status>,
     diagnostics: Publisher<DiagnosticArray>,
@@ -50,6 +51,7 @@ impl Dds {
         Ok(Self {
             velocity: publisher(&mut node, &topics.velocity)?,
             ego_motion: publisher(&mut node, &topics.ego_motion)?,
+            proximity: publisher(&mut node, &topics.proximity)?,
             step: publisher(&mut node, &topics.step)?,
             status: publisher(&mut node, &topics.status)?,
             diagnostics: publisher(&mut node, &topics.diagnostics)?,
@@ -70,6 +72,7 @@ impl Network for Dds {
         match message {
             Message::Velocity(message) => publish(&self.velocity, message),
             Message::EgoMotion(message) => publish(&self.ego_motion, message),
+            Message::Proximity(message) => publish(&self.proximity, message),
             Message::Step(message) => publish(&self.step, message),
             Message::Status(message) => publish(&self.status, message),
             Message::Diagnostics(message) => publish(&self.diagnostics, message),

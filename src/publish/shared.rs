@@ -7,7 +7,7 @@ use iceoryx2::prelude::ZeroCopySend;
 use super::Moved;
 use crate::{
     flow::{Cause, State},
-    motion::{Lack, Scale, Velocity},
+    motion::{Lack, NoSight, Obstacles, SECTORS, Scale, Sector, Velocity},
     wire,
 };
 
@@ -135,6 +135,62 @@ pub struct StatusSample {
     pub last_error: [u8; 256],
 }
 
+/// The payload of `<prefix>/obstacles`, sent with every step: where nothing is known `valid` is 0 and every sector
+/// unknown.
+///
+/// Sector k looks along −π + k·2π/72 in the body frame with its roll and pitch taken off, counter-clockwise from above;
+/// 36 looks forward.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[type_name("nightflow::ObstaclesSample")]
+pub struct ObstaclesSample {
+    /// Stamp of the older frame.
+    pub older_ns: i64,
+    /// Stamp of the newer frame, which everything here belongs to.
+    pub newer_ns: i64,
+    /// When the sample was sent.
+    pub published_ns: i64,
+    /// The step, as in [`FlowHeader`].
+    pub step: u64,
+    /// Unit vector of the motion by the flow, level body frame.
+    pub heading: [f64; 3],
+    /// Its largest standard deviation, rad.
+    pub heading_sd: f64,
+    /// Speed over ground, m/s; NaN when it is not metric.
+    pub speed: f64,
+    /// What is met later than this is not in the way, s.
+    pub horizon_s: f64,
+    /// Time constant of the filter, s.
+    pub delay_s: f64,
+    /// 1 when the surroundings were looked at, 0 when not.
+    pub valid: u32,
+    /// 0 ok, 1 degraded, 2 blind.
+    pub state: u32,
+    /// Why it is not ok, see [`cause_code`].
+    pub cause: u32,
+    /// Why nothing is known, see [`sight_code`].
+    pub sight: u32,
+    /// Seconds to contact of an occupied sector; NaN of any other.
+    pub ttc_s: [f32; SECTORS],
+    /// Metres to what occupies a sector, if it stands still; NaN of any other and without a metric speed.
+    pub distance_m: [f32; SECTORS],
+    /// Probability of what is said of a sector, 0…1; 0 where it is unknown.
+    pub confidence: [f32; SECTORS],
+    /// 0 unknown, 1 free, 2 occupied.
+    pub sector: [u8; SECTORS],
+}
+
+/// [`ObstaclesSample::sight`]: 0 seen, 64 not asked for, 65 bare, 66 no parallax; below 64 a [`lack_code`].
+pub fn sight_code(obstacles: &Result<Obstacles, NoSight>) -> u32 {
+    match obstacles {
+        Ok(_) => 0,
+        Err(NoSight::Lack(lack)) => code(lack),
+        Err(NoSight::Off) => 64,
+        Err(NoSight::Bare { .. }) => 65,
+        Err(NoSight::Parallax { .. }) => 66,
+    }
+}
+
 /// [`FlowHeader::cause`]: 0 none, 1 dark, 2 saturated, 3 gain step, 4 unsure, 5 frozen, 6 noisy.
 pub fn cause_code(state: &State) -> u32 {
     match state {
@@ -153,15 +209,18 @@ pub fn cause_code(state: &State) -> u32 {
 /// [`VelocitySample::lack`]: 0 none, 1 blind, 2 calibration, 3 camera size, 4 gyro, 5 gyro gap, 6 disagreement,
 /// 7 degenerate.
 pub fn lack_code(velocity: &Result<Velocity, Lack>) -> u32 {
-    match velocity {
-        Ok(_) => 0,
-        Err(Lack::Blind) => 1,
-        Err(Lack::Calibration) => 2,
-        Err(Lack::CameraSize { .. }) => 3,
-        Err(Lack::Gyro) => 4,
-        Err(Lack::GyroGap { .. }) => 5,
-        Err(Lack::Disagreement { .. }) => 6,
-        Err(Lack::Degenerate) => 7,
+    velocity.as_ref().err().map_or(0, code)
+}
+
+fn code(lack: &Lack) -> u32 {
+    match lack {
+        Lack::Blind => 1,
+        Lack::Calibration => 2,
+        Lack::CameraSize { .. } => 3,
+        Lack::Gyro => 4,
+        Lack::GyroGap { .. } => 5,
+        Lack::Disagreement { .. } => 6,
+        Lack::Degenerate => 7,
     }
 }
 
@@ -247,6 +306,49 @@ impl From<&Moved> for VelocitySample {
     }
 }
 
+impl From<&Moved> for ObstaclesSample {
+    /// All but the time of sending. In a blind step nothing is known, whatever was computed.
+    fn from(moved: &Moved) -> Self {
+        let blind = matches!(moved.state, State::Blind(_)) && moved.obstacles.is_ok();
+        let found = if blind { Err(NoSight::Lack(Lack::Blind)) } else { moved.obstacles };
+        let mut sample = Self {
+            older_ns: moved.older.ns(),
+            newer_ns: moved.newer.ns(),
+            published_ns: 0,
+            step: moved.step,
+            heading: [f64::NAN; 3],
+            heading_sd: f64::NAN,
+            speed: f64::NAN,
+            horizon_s: f64::NAN,
+            delay_s: f64::NAN,
+            valid: 0,
+            state: state_code(&moved.state),
+            cause: cause_code(&moved.state),
+            sight: sight_code(&found),
+            ttc_s: [f32::NAN; SECTORS],
+            distance_m: [f32::NAN; SECTORS],
+            confidence: [0.0; SECTORS],
+            sector: [0; SECTORS],
+        };
+        if let Ok(found) = found {
+            (sample.heading, sample.heading_sd) = (found.heading, found.heading_sd_rad);
+            (sample.speed, sample.horizon_s) = (found.speed.unwrap_or(f64::NAN), found.horizon_s);
+            (sample.delay_s, sample.valid) = (found.delay_s, 1);
+            for (k, sector) in found.sectors.iter().enumerate() {
+                (sample.sector[k], sample.confidence[k]) = match sector {
+                    Sector::Unknown => (0, 0.0),
+                    Sector::Free { confidence } => (1, *confidence as f32),
+                    Sector::Occupied { ttc_s, distance_m, confidence } => {
+                        (sample.ttc_s[k], sample.distance_m[k]) = (*ttc_s as f32, *distance_m as f32);
+                        (2, *confidence as f32)
+                    }
+                };
+            }
+        }
+        sample
+    }
+}
+
 impl From<&wire::Status> for StatusSample {
     fn from(status: &wire::Status) -> Self {
         Self {
@@ -304,6 +406,7 @@ mod tests {
     fn layouts_are_those_that_the_other_languages_declare() {
         assert_eq!((size_of::<FlowHeader>(), align_of::<FlowHeader>()), (96, 8));
         assert_eq!((size_of::<VelocitySample>(), align_of::<VelocitySample>()), (408, 8));
+        assert_eq!((size_of::<ObstaclesSample>(), align_of::<ObstaclesSample>()), (1040, 8));
         assert_eq!((size_of::<StatusSample>(), align_of::<StatusSample>()), (472, 8));
     }
 

@@ -9,7 +9,7 @@ use super::{
 use crate::{
     camera::zenoh::session,
     clock,
-    wire::{self, DiagnosticArray, EgoMotion, Image, Status, Step, TwistWithCovarianceStamped, rmw},
+    wire::{self, DiagnosticArray, EgoMotion, Image, LaserScan, Status, Step, TwistWithCovarianceStamped, rmw},
 };
 
 const NAME: &str = "zenoh";
@@ -24,6 +24,7 @@ pub fn open(config: &Config, settings: &Zenoh) -> Result<Courier, Error> {
 struct Outlets {
     velocity: Outlet,
     ego_motion: Outlet,
+    proximity: Outlet,
     step: Outlet,
     status: Outlet,
     diagnostics: Outlet,
@@ -49,6 +50,7 @@ impl Outlets {
         Ok(Self {
             velocity: opening.outlet::<TwistWithCovarianceStamped>(&topics.velocity)?,
             ego_motion: opening.outlet::<EgoMotion>(&topics.ego_motion)?,
+            proximity: opening.outlet::<LaserScan>(&topics.proximity)?,
             step: opening.outlet::<Step>(&topics.step)?,
             status: opening.outlet::<Status>(&topics.status)?,
             diagnostics: opening.outlet::<DiagnosticArray>(&topics.diagnostics)?,
@@ -66,6 +68,7 @@ impl Network for Outlets {
         match message {
             Message::Velocity(message) => self.velocity.put(message),
             Message::EgoMotion(message) => self.ego_motion.put(message),
+            Message::Proximity(message) => self.proximity.put(message),
             Message::Step(message) => self.step.put(message),
             Message::Status(message) => self.status.put(message),
             Message::Diagnostics(message) => self.diagnostics.put(message),

@@ -50,7 +50,7 @@ pub fn compare(
 /// A sink that compares each step with the recording that it is a replay of.
 pub struct Check {
     comparison: Comparison<Outputs>,
-    topics: [String; 5],
+    topics: [String; TOPICS.len()],
     body_frame: String,
     item: StepItem,
     image: Image,
@@ -96,10 +96,13 @@ impl Check {
         if item.has_twist {
             take(2, encoded(&item.twist, &mut self.cdr)?)?;
         }
+        if item.has_proximity {
+            take(3, encoded(&item.proximity, &mut self.cdr)?)?;
+        }
         outgoing::flow_image(&item.flow.frame_id, &offer.flow, &mut self.image);
-        take(3, encoded(&self.image, &mut self.cdr)?)?;
+        take(4, encoded(&self.image, &mut self.cdr)?)?;
         outgoing::confidence_image(&item.flow.frame_id, &offer.flow, &mut self.image);
-        Ok(take(4, encoded(&self.image, &mut self.cdr)?)?)
+        Ok(take(5, encoded(&self.image, &mut self.cdr)?)?)
     }
 }
 
@@ -181,7 +184,7 @@ impl<I: Iterator<Item = Output>> Comparison<I> {
                     Ok(())
                 }
                 // A recording may be without flow; a velocity that is missing beside its step was not there.
-                1 | 2 if self.step == Some(stamp) => {
+                1..=3 if self.step == Some(stamp) => {
                     differs(topic, stamp, "the replay gives one, none was recorded".into())
                 }
                 _ => Ok(()),

@@ -9,7 +9,7 @@ use crate::{
 };
 
 /// Topics below the namespace that depend on the recorded samples alone; status also depends on the clock.
-pub(super) const TOPICS: [&str; 5] = ["step", "ego_motion", "velocity", "flow", "flow_confidence"];
+pub(super) const TOPICS: [&str; 6] = ["step", "ego_motion", "velocity", "proximity", "flow", "flow_confidence"];
 
 /// One recorded output.
 #[derive(Debug, Clone, PartialEq, Eq)]

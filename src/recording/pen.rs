@@ -25,6 +25,7 @@ pub(super) struct Topics {
     step: String,
     ego_motion: String,
     velocity: String,
+    proximity: String,
     flow: String,
     flow_confidence: String,
     status: String,
@@ -41,6 +42,7 @@ impl Topics {
             step: under("step"),
             ego_motion: under("ego_motion"),
             velocity: under("velocity"),
+            proximity: under("proximity"),
             flow: under("flow"),
             flow_confidence: under("flow_confidence"),
             status: under("status"),
@@ -104,6 +106,9 @@ impl Pen {
         }
         if item.has_twist {
             put(writer, &topics.velocity, 0, time, stamp, &item.twist)?;
+        }
+        if item.has_proximity {
+            put(writer, &topics.proximity, 0, time, stamp, &item.proximity)?;
         }
         if self.flow {
             let flow = item.flow.flow();

@@ -12,7 +12,7 @@ use crate::{
         Offer,
         outgoing::{self, Kept},
     },
-    wire::{EgoMotion, Status, Step, TwistWithCovarianceStamped},
+    wire::{EgoMotion, LaserScan, Status, Step, TwistWithCovarianceStamped},
 };
 
 /// The outputs of one step.
@@ -23,6 +23,8 @@ pub(super) struct StepItem {
     pub(super) has_motion: bool,
     pub(super) twist: TwistWithCovarianceStamped,
     pub(super) has_twist: bool,
+    pub(super) proximity: LaserScan,
+    pub(super) has_proximity: bool,
     pub(super) flow: Kept,
 }
 
@@ -33,6 +35,7 @@ impl StepItem {
         outgoing::fill_step(moved, &mut self.step);
         self.has_motion = outgoing::fill_ego_motion(moved, body_frame, &mut self.motion);
         self.has_twist = outgoing::fill_twist(moved, body_frame, &mut self.twist);
+        self.has_proximity = outgoing::fill_proximity(moved, body_frame, &mut self.proximity);
         if flow {
             self.flow.keep(offer);
         }

@@ -143,6 +143,9 @@ fn python_reads_flow_confidence_and_velocity() {
             format!("velocity {step} 1.5000 -0.2500 {:.4} covariance 0.0100 quality 200", step as f64)
         };
         assert_eq!(velocity, expected);
+        let obstacles = peer.line_starting("obstacles", PATIENCE);
+        let expected = if blind { "unknown" } else { "nearest sector 38 in 2.0000 s at 6.0000 m, 1 free, 70 unknown" };
+        assert_eq!(obstacles, format!("obstacles {step} {expected}"));
     }
     peer.finish(PATIENCE);
     assert_eq!((sink.copied(), sink.lost()), (0, 0));

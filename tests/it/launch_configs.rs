@@ -45,6 +45,9 @@ fn each_file_opens_what_it_is_for() {
     let mavlink = ardupilot.publish.mavlink.unwrap();
     assert_eq!((mavlink.autopilot, mavlink.words), (Autopilot::Ardupilot, vec![Word::Flow]));
     assert!(matches!(mavlink.link, Link::Serial(_)) && ardupilot.publish.px4.is_none());
+    let forward = config("forward_avoidance.toml");
+    assert!(forward.motion.camera == Mount::Forward && forward.motion.obstacles.is_some());
+    assert!(forward.publish.ros2.is_some() && forward.publish.iceoryx2.is_some());
     let replay = config("replay.toml");
     let SourceConfig::Mcap(bag) = replay.camera.source else { panic!("a recording is replayed") };
     assert!(Path::new(env!("CARGO_MANIFEST_DIR")).join(bag.path).is_file());

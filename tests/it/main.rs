@@ -18,6 +18,7 @@ mod motion;
 mod noise;
 mod noise_command;
 mod noise_node;
+mod obstacles;
 mod onnx_bytes;
 mod peers;
 mod recording;

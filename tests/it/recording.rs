@@ -10,7 +10,7 @@ use nightflow::{
     clock::Stamp,
     exposure::Exposed,
     flow::{Cause, Flow, Grid, State},
-    motion::{Integrated, Lack, NoFlow, Scale, Velocity},
+    motion::{Integrated, Lack, NoFlow, Obstacles, SECTORS, Scale, Sector, Velocity},
     publish::{Moved, Offer, Sink},
     recording::{self, Compression, Config, Output, Outputs, Recorder, Writer, check},
     wire::{CameraInfo, Header, Image, Imu, Range, Status, Vector3},
@@ -100,7 +100,18 @@ pub fn moved(step: u64, state: State) -> Moved {
         state,
         velocity,
         integrated: Integrated::without(older, newer, NoFlow::Blind),
+        obstacles: Ok(obstacles(older, newer)),
     }
+}
+
+/// A metre and a half to the left of ahead something stands, to the right of it nothing does.
+fn obstacles(older: Stamp, newer: Stamp) -> Obstacles {
+    let mut sectors = [Sector::Unknown; SECTORS];
+    sectors[35] = Sector::Free { confidence: 0.75 };
+    sectors[38] = Sector::Occupied { ttc_s: 2.0, distance_m: 6.0, confidence: 0.875 };
+    let heading = [1.0, 0.0, 0.0];
+    let (speed, horizon_s, delay_s) = (Some(3.0), 8.0, 0.15);
+    Obstacles { older, newer, sectors, heading, heading_sd_rad: 0.01, speed, horizon_s, delay_s }
 }
 
 /// Offers a step whose vectors depend on its number and on `shift`.
@@ -174,10 +185,10 @@ fn a_recording_is_read_back_in_the_order_in_which_the_pipeline_saw_it() {
         let topics: Vec<_> = blind.map(|output| output.topic.as_str()).collect();
         assert_eq!(
             topics,
-            ["/nightflow/step", "/nightflow/flow", "/nightflow/flow_confidence"],
+            ["/nightflow/step", "/nightflow/proximity", "/nightflow/flow", "/nightflow/flow_confidence"],
             "blind has no velocity"
         );
-        assert_eq!(outputs.len(), 3 * 5 + 3);
+        assert_eq!(outputs.len(), 3 * 6 + 4);
         assert_eq!(recording::metadata(&path, "nightflow").unwrap(), Some(settings()));
     }
 }
@@ -231,15 +242,16 @@ fn python_readers_see_every_message() {
     has("summary /nightflow/step nightflow_msgs/msg/Step ros2msg/cdr 2 reliable/keep_last/10 RIHS01_");
     has("summary /nightflow/ego_motion nightflow_msgs/msg/EgoMotion ros2msg/cdr 1 reliable/keep_last/10 RIHS01_");
     has("summary /nightflow/velocity geometry_msgs/msg/TwistWithCovarianceStamped ros2msg/cdr 1 reliable");
+    has("summary /nightflow/proximity sensor_msgs/msg/LaserScan ros2msg/cdr 2 reliable/keep_last/10 RIHS01_");
     has("summary /nightflow/flow sensor_msgs/msg/Image ros2msg/cdr 2 ");
     has("summary /nightflow/flow_confidence sensor_msgs/msg/Image ros2msg/cdr 2 ");
     has("summary /nightflow/status nightflow_msgs/msg/Status ros2msg/cdr 1 reliable/keep_last/10 RIHS01_");
     has("metadata nightflow config,model_sha256,version");
     has("metadata rosbag2 serialized_metadata");
-    has("rosbags 17");
+    has("rosbags 19");
     for reader in ["mcap", "rosbags"] {
         let lines: Vec<&str> = printed.lines().filter(|line| line.starts_with(&format!("message {reader} "))).collect();
-        assert_eq!(lines.len(), 17, "{printed}");
+        assert_eq!(lines.len(), 19, "{printed}");
         let one = |topic: &str, nth: usize, values: &[&str]| {
             let line = lines.iter().filter(|line| line.split(' ').nth(2) == Some(topic)).nth(nth).unwrap();
             for value in values {
@@ -254,6 +266,12 @@ fn python_readers_see_every_message() {
         one("/nightflow/step", 1, &["step=1", "state=2", "cause=too dark: raw mean 0.00010", "velocity_lacks=blind"]);
         one("/nightflow/ego_motion", 0, &["scale=0", "distance=12.5", "twist.covariance[35]=0.01", "quality=200"]);
         one("/nightflow/velocity", 0, &["header.frame_id=base_link", "twist.twist.linear.y=-0.25"]);
+        one(
+            "/nightflow/proximity",
+            0,
+            &["range_max=24.0", "ranges[38]=6.0", "ranges[35]=inf", "intensities[38]=0.875"],
+        );
+        one("/nightflow/proximity", 1, &["ranges[38]=nan", "intensities[38]=0.0"]);
         one("/nightflow/flow", 0, &["encoding=32FC2", "step=32", "data=64:"]);
         one("/nightflow/status", 0, &["frames=3"]);
     }
@@ -348,7 +366,7 @@ fn a_check_names_the_first_value_that_differs() {
     let said = |steps: &[(u64, State, f32)]| replay(steps).unwrap_err().to_string();
     let ok = State::Ok;
     let right = [(0, ok.clone(), 0.0), (1, dark(), 0.0), (2, ok.clone(), 0.0), (3, ok.clone(), 0.0)];
-    assert_eq!(replay(&right), Ok(check::Checked { equal: 18, holes: 0 }));
+    assert_eq!(replay(&right), Ok(check::Checked { equal: 22, holes: 0 }));
 
     let mut shifted = right.clone();
     shifted[2].2 = 0.25;
@@ -360,10 +378,10 @@ fn a_check_names_the_first_value_that_differs() {
     assert!(said(&right[1..]).contains("recorded, but the replay gives none"));
 
     let outputs = || Outputs::open(&path, "/nightflow").unwrap();
-    assert_eq!(check::compare(outputs(), outputs()).unwrap().equal, 18);
+    assert_eq!(check::compare(outputs(), outputs()).unwrap().equal, 22);
     // The recording lost a step: that is a hole, not a difference.
     let holed = outputs().filter(|output| output.stamp != moved(2, State::Ok).newer);
-    assert_eq!(check::compare(holed, outputs()), Ok(check::Checked { equal: 13, holes: 1 }));
+    assert_eq!(check::compare(holed, outputs()), Ok(check::Checked { equal: 16, holes: 1 }));
     let mut last: Vec<Output> = outputs().collect();
     let index = last.iter().rposition(|output| output.topic == "/nightflow/velocity").unwrap();
     last.remove(index);

@@ -9,7 +9,7 @@ use nightflow::{
     clock::Stamp,
     exposure::Exposed,
     flow::{Cause, Flow, Grid, State},
-    motion::{Integrated, NoDistance, NoFlow, Scale, Velocity},
+    motion::{Integrated, NoDistance, NoFlow, Obstacles, SECTORS, Scale, Sector, Velocity},
     publish::{Config, Moved, Offer, Sink},
     wire::{Header, Status},
 };
@@ -95,6 +95,24 @@ fn moved(step: u64) -> Moved {
         state,
         velocity: Ok(velocity),
         integrated: Integrated::without(older, newer, NoFlow::Blind),
+        obstacles: Ok(obstacles(older, newer, matches!(scale, Scale::Metric { .. }))),
+    }
+}
+
+/// Free a sector to the right of ahead, occupied ahead, unknown elsewhere.
+fn obstacles(older: Stamp, newer: Stamp, metric: bool) -> Obstacles {
+    let mut sectors = [Sector::Unknown; SECTORS];
+    sectors[35] = Sector::Free { confidence: 0.75 };
+    sectors[36] = Sector::Occupied { ttc_s: 2.0, distance_m: if metric { 6.0 } else { f64::NAN }, confidence: 0.875 };
+    Obstacles {
+        older,
+        newer,
+        sectors,
+        heading: [1.0, 0.0, 0.0],
+        heading_sd_rad: 0.015625,
+        speed: metric.then_some(3.0),
+        horizon_s: 8.0,
+        delay_s: 0.15,
     }
 }
 

@@ -98,6 +98,20 @@ class Range(IdlStruct, typename=named("sensor_msgs", "Range")):
 
 
 @dataclass
+class LaserScan(IdlStruct, typename=named("sensor_msgs", "LaserScan")):
+    header: Header
+    angle_min: t.float32
+    angle_max: t.float32
+    angle_increment: t.float32
+    time_increment: t.float32
+    scan_time: t.float32
+    range_min: t.float32
+    range_max: t.float32
+    ranges: t.sequence[t.float32]
+    intensities: t.sequence[t.float32]
+
+
+@dataclass
 class Twist(IdlStruct, typename=named("geometry_msgs", "Twist")):
     linear: Vector3
     angular: Vector3

@@ -12,6 +12,7 @@ from dds_messages import (
     DiagnosticArray,
     EgoMotion,
     Image,
+    LaserScan,
     Status,
     Step,
     TwistWithCovarianceStamped,
@@ -33,6 +34,7 @@ types = {
     "nightflow_msgs/msg/Status": Status,
     "diagnostic_msgs/msg/DiagnosticArray": DiagnosticArray,
     "sensor_msgs/msg/Image": Image,
+    "sensor_msgs/msg/LaserScan": LaserScan,
 }
 
 

@@ -48,6 +48,7 @@ class Results:
         self.kinds = {
             f"{namespace}/velocity": "geometry_msgs/msg/TwistWithCovarianceStamped",
             f"{namespace}/ego_motion": "nightflow_msgs/msg/EgoMotion",
+            f"{namespace}/proximity": "sensor_msgs/msg/LaserScan",
             f"{namespace}/step": "nightflow_msgs/msg/Step",
             f"{namespace}/status": "nightflow_msgs/msg/Status",
             "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
@@ -90,6 +91,20 @@ class Results:
         assert message.distance == 12.5 if message.scale == 0 else math.isnan(message.distance), message
         assert (message.samples, message.inliers, message.quality) == (500, 400, 200), message
         self.motion(message.twist)
+
+    def proximity(self, message):
+        step = self.step_of(message, "base_link")
+        increment = 2 * math.pi / 72
+        assert close(message.angle_min, -math.pi) and close(message.angle_increment, increment), message
+        assert close(message.angle_max, math.pi - increment) and close(message.scan_time, 0.02), message
+        ranges, intensities = list(message.ranges), list(message.intensities)
+        assert len(ranges) == len(intensities) == 72, message
+        if step % 3 != 0:
+            assert all(math.isnan(value) for value in ranges) and not any(intensities), "what is unknown isn't free"
+            return
+        assert message.range_max == 24, message
+        assert (ranges[35], ranges[36], intensities[35], intensities[36]) == (math.inf, 6, 0.75, 0.875), message
+        assert all(math.isnan(value) for k, value in enumerate(ranges) if k not in (35, 36)), message
 
     def step(self, message):
         step = self.step_of(message, "camera_optical")

@@ -153,7 +153,7 @@ mod tests {
         clock::Stamp,
         exposure::Exposed,
         flow::{Flow, Grid},
-        motion::{Lack, NoFlow},
+        motion::{Lack, NoFlow, NoSight},
         publish::Moved,
     };
 
@@ -207,6 +207,7 @@ mod tests {
             state: State::Ok,
             velocity: Err(Lack::Gyro),
             integrated: Integrated::without(older, newer, NoFlow::Blind),
+            obstacles: Err(NoSight::Off),
         };
         let flow = Flow { older, newer, grid, vectors: &[], confidence: &[] };
         feed.offer(&Offer { moved: &moved, flow, image: &Exposed::default() }).is_ok()

@@ -7,7 +7,7 @@ use crate::{
     clock::Stamp,
     exposure::Exposed,
     flow::{Cause, Flow, State},
-    motion::{Integrated, Lack, NoFlow},
+    motion::{Integrated, Lack, NoFlow, NoSight},
 };
 
 const GRID: Grid = Grid { width: 8, height: 4, scale: [4.0, 4.0] };
@@ -37,6 +37,7 @@ fn moved(step: u64, grid: Grid) -> Moved {
         state: State::Blind(Cause::Frozen),
         velocity: Err(Lack::Blind),
         integrated: Integrated::without(Stamp::from_ns(1), Stamp::from_ns(2), NoFlow::Blind),
+        obstacles: Err(NoSight::Off),
     }
 }
 

@@ -4,7 +4,7 @@ use nalgebra::{UnitQuaternion, Vector3};
 use nightflow::{
     clock::Stamp,
     flow::{Cause, Flow, Grid, State},
-    motion::{Config, Odometer},
+    motion::{Config, NoSight, Odometer},
     publish::Moved,
     wire::{CameraInfo, Header, Imu, Range, Vector3 as Wire3},
 };
@@ -126,5 +126,6 @@ pub fn moved(step: u64, older: Stamp, action: &Move, blind: bool) -> Moved {
         state: if blind { State::Blind(Cause::Frozen) } else { State::Ok },
         velocity: odometer.velocity(&flow, SIZE),
         integrated: odometer.integrated(&flow, SIZE, blind),
+        obstacles: Err(NoSight::Off),
     }
 }
