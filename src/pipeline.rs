@@ -87,7 +87,7 @@ impl Pipeline {
         Ok(Self {
             exposure: Developer::new(&config.exposure)?,
             flow,
-            motion: Odometer::new(&motion)?.exposing(config.camera.exposure_s),
+            motion: Odometer::new(&motion)?.exposing(config.camera.exposure_s).standing_in(&config.publish.body_frame),
             lookout: motion.obstacles.as_ref().map(Lookout::new).transpose()?,
             gap_ms_max: config.flow.gap_ms_max,
             newest: None,
@@ -102,6 +102,7 @@ impl Pipeline {
             Sample::Info(info) => Ok(self.motion.info(info).map(|()| Outcome::Noted)?),
             Sample::Imu(imu) => Ok(self.motion.imu(imu).map(|()| Outcome::Noted)?),
             Sample::Range(range) => Ok(self.motion.range(range).map(|()| Outcome::Noted)?),
+            Sample::Transforms(message) => Ok(self.motion.transforms(message).map(|()| Outcome::Noted)?),
         }
     }
 

@@ -111,7 +111,7 @@ pub fn fly(plan: Plan) -> Result<Flown, String> {
                     frames
                         .push(frame.image.data.as_chunks::<2>().0.iter().map(|two| u16::from_le_bytes(*two)).collect());
                 }
-                Sample::Info(_) => {}
+                Sample::Info(_) | Sample::Transforms(_) => {}
             }
         }
         truth.push(Moment { stamp: shot.truth.stamp, velocity: shot.truth.velocity, rates: shot.truth.rates });

@@ -39,6 +39,7 @@ enum Kind {
     Info,
     Imu,
     Range,
+    Transforms,
 }
 
 impl Kind {
@@ -48,6 +49,7 @@ impl Kind {
             Kind::Info => "sensor_msgs/msg/CameraInfo",
             Kind::Imu => "sensor_msgs/msg/Imu",
             Kind::Range => "sensor_msgs/msg/Range",
+            Kind::Transforms => "tf2_msgs/msg/TFMessage",
         }
     }
 }
@@ -57,7 +59,7 @@ pub struct Recording {
     path: PathBuf,
     files: VecDeque<PathBuf>,
     open: Option<Messages<File>>,
-    topics: [(String, Kind); 4],
+    topics: [(String, Kind); 5],
     /// Channels of the open file whose kind was settled.
     settled: BTreeMap<u16, Option<Kind>>,
     /// Topics that were seen but not asked for.
@@ -91,6 +93,7 @@ impl Recording {
                 named(&config.info_topic, Kind::Info),
                 named(&config.imu_topic, Kind::Imu),
                 named(&config.range_topic, Kind::Range),
+                named(&config.tf_topic, Kind::Transforms),
             ],
             settled: BTreeMap::new(),
             others: Vec::new(),
@@ -216,6 +219,7 @@ fn decoded(kind: Kind, message: &Message<'_>, received: Stamp) -> Result<Sample,
         Kind::Info => Sample::Info(Arc::new(wire::decode(&message.data)?)),
         Kind::Imu => Sample::Imu(Arc::new(wire::decode(&message.data)?)),
         Kind::Range => Sample::Range(Arc::new(wire::decode(&message.data)?)),
+        Kind::Transforms => Sample::Transforms(Arc::new(wire::decode(&message.data)?)),
     })
 }
 

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     clock::Stamp,
-    wire::{self, CameraInfo, Image, Imu, Range},
+    wire::{self, CameraInfo, Image, Imu, Range, TfMessage},
 };
 
 /// A camera frame as it came: the mosaic is looked at by [`crate::exposure`] only.
@@ -41,6 +41,8 @@ pub enum Sample {
     Imu(Arc<Imu>),
     /// Distance to the ground.
     Range(Arc<Range>),
+    /// Where frames of reference stand in each other.
+    Transforms(Arc<TfMessage>),
 }
 
 impl Sample {
@@ -51,6 +53,9 @@ impl Sample {
             Sample::Info(info) => info.header.stamp.into(),
             Sample::Imu(imu) => imu.header.stamp.into(),
             Sample::Range(range) => range.header.stamp.into(),
+            Sample::Transforms(message) => {
+                message.transforms.iter().map(|one| one.header.stamp.into()).min().unwrap_or_default()
+            }
         }
     }
 }
@@ -134,6 +139,8 @@ pub struct Config {
     pub imu_topic: String,
     /// Topic of the range finder.
     pub range_topic: String,
+    /// Topic of the transforms, for `[motion] camera = "tf"`; empty reads none.
+    pub tf_topic: String,
     /// A source is called lost after this time without a frame.
     pub silence_s_max: f64,
     /// How long an exposure lasts that begins at its frame's stamp.
@@ -156,6 +163,7 @@ impl Default for Config {
             info_topic: "/camera/camera_info".into(),
             imu_topic: "/imu/data_raw".into(),
             range_topic: "/range".into(),
+            tf_topic: "/tf_static".into(),
             silence_s_max: 1.0,
             exposure_s: 0.0,
         }
@@ -168,6 +176,7 @@ pub const REASONS: &[(&str, &str)] = &[
     ("info_topic", "beside the images, as camera drivers put it"),
     ("imu_topic", "REP 145: what the sensor measured, with no orientation mixed in"),
     ("range_topic", "no convention exists; set it to the range finder's"),
+    ("tf_topic", "where robot_state_publisher says how sensors sit; a camera on a moving gimbal is told on /tf"),
     ("silence_s_max", "1: thirty frames of a 30 Hz camera, and soon enough for a pilot"),
     (
         "exposure_s",

@@ -6,7 +6,7 @@ use futures::{Stream, StreamExt, future, stream};
 use ros2_client::{
     CreateResult, MessageInfo, MessageTypeName, Name, NodeName, NodeOptions, QosProfile, ReadError,
     dds::{Context, Node, Spinner, Subscription},
-    qos::{History, WhenFull},
+    qos::{Durability, History, WhenFull},
 };
 use rustdds::{DomainParticipantBuilder, Topic};
 use serde::de::DeserializeOwned;
@@ -18,7 +18,7 @@ use super::{
 };
 use crate::{
     clock,
-    wire::{CameraInfo, Image, Imu, Message, Range},
+    wire::{CameraInfo, Image, Imu, Message, Range, TfMessage},
 };
 
 /// The socket receive buffer that holds a 1280×1024 16-bit frame's datagrams while the reader is at another one. With
@@ -29,6 +29,8 @@ pub const RECEIVE_BUFFER_WANTED: usize = 4 << 20;
 const FRAME_DEPTH: usize = 8;
 /// The gyro sends many small samples while one frame is decoded.
 const SMALL_DEPTH: usize = 128;
+/// As many as tf2's own listener keeps.
+const TF_DEPTH: usize = 100;
 
 /// The largest socket receive buffer that the kernel grants, where it says so (Linux).
 pub fn receive_buffer_max() -> Option<usize> {
@@ -62,6 +64,10 @@ impl Ros2Source {
             info: subscribe(&mut node, &config.info_topic, settings.reliable, SMALL_DEPTH)?,
             imu: subscribe(&mut node, &config.imu_topic, settings.reliable, SMALL_DEPTH)?,
             range: subscribe(&mut node, &config.range_topic, settings.reliable, SMALL_DEPTH)?,
+            transforms: match config.tf_topic.as_str() {
+                "" => None,
+                topic => Some(subscribe_with(&mut node, topic, tf_qos(topic))?),
+            },
         };
         let (sender, latest) = mailbox(SMALL_ROOM);
         let (stop, stopped) = oneshot::channel();
@@ -147,11 +153,23 @@ struct Readers {
     info: Subscription<CameraInfo>,
     imu: Subscription<Imu>,
     range: Subscription<Range>,
+    transforms: Option<Subscription<TfMessage>>,
 }
 
 fn subscribe<M: Message>(node: &mut Node, name: &str, reliable: bool, depth: usize) -> Result<Subscription<M>, Error> {
     let qos = QosProfile::subscription_default().history(History::KeepLast { depth });
     let qos = if reliable { qos.reliability_reliable(WhenFull::DEFAULT) } else { qos.reliability_best_effort() };
+    subscribe_with(node, name, qos)
+}
+
+/// As tf2 listens: what was said once before we came is asked for too, where its sender keeps it.
+fn tf_qos(name: &str) -> QosProfile {
+    let qos = QosProfile::subscription_default().reliability_reliable(WhenFull::DEFAULT);
+    let qos = qos.history(History::KeepLast { depth: TF_DEPTH });
+    if name.ends_with("_static") { qos.durability(Durability::TransientLocal) } else { qos }
+}
+
+fn subscribe_with<M: Message>(node: &mut Node, name: &str, qos: QosProfile) -> Result<Subscription<M>, Error> {
     let topic = topic::<M>(node, name, &qos).map_err(Error::Settings)?;
     node.create_subscription(&topic, Some(qos))
         .map_err(|e| Error::Lost { source_name: "ros2".into(), reason: format!("{name}: {e}") })
@@ -171,12 +189,14 @@ fn samples<'a, M: Message + DeserializeOwned>(
 async fn receive(mut node: Node, readers: Readers, sender: Sender, stopped: oneshot::Receiver<()>) {
     let spinning = spin(node.spinner());
     let frame = |image| Sample::Frame(Arc::new(Frame { image, received: clock::now() }));
-    let received = stream::select_all([
+    let transforms = readers.transforms.as_ref();
+    let transforms = transforms.map(|reader| samples(reader, |message| Sample::Transforms(Arc::new(message))));
+    let received = stream::select_all(transforms.into_iter().chain([
         samples(&readers.image, frame),
         samples(&readers.info, |info| Sample::Info(Arc::new(info))),
         samples(&readers.imu, |imu| Sample::Imu(Arc::new(imu))),
         samples(&readers.range, |range| Sample::Range(Arc::new(range))),
-    ]);
+    ]));
     let delivering = received.take_until(stopped).for_each(|received| {
         deliver(&sender, received);
         future::ready(())

@@ -8,7 +8,13 @@ use std::{
     time::Duration,
 };
 
-use ::zenoh::{Session, Wait, liveliness::LivelinessToken, pubsub::Subscriber, sample::SampleKind};
+use ::zenoh::{
+    Session, Wait,
+    liveliness::LivelinessToken,
+    pubsub::Subscriber,
+    query::{ConsolidationMode, QueryTarget, ReplyKeyExpr},
+    sample::SampleKind,
+};
 
 use super::{
     Config, Counts, Error, Frame, Next, Sample, Source, Zenoh,
@@ -40,6 +46,9 @@ impl ZenohSource {
         opening.subscribe(&config.info_topic, |info| Sample::Info(Arc::new(info)))?;
         opening.subscribe(&config.imu_topic, |imu| Sample::Imu(Arc::new(imu)))?;
         opening.subscribe(&config.range_topic, |range| Sample::Range(Arc::new(range)))?;
+        if !config.tf_topic.is_empty() {
+            opening.subscribe_kept(&config.tf_topic, |message| Sample::Transforms(Arc::new(message)))?;
+        }
         let Opening { subscribers, tokens, .. } = opening;
         Ok(Self { latest, _subscribers: subscribers, _tokens: tokens, session })
     }
@@ -111,21 +120,63 @@ impl<'a> Opening<'a> {
     }
 
     fn subscribe<M: Message>(&mut self, topic: &str, sample: fn(M) -> Sample) -> Result<(), Error> {
-        let key = match &self.node {
+        self.listen(topic, &self.arrivals(sample), rmw::QOS_SENSOR)
+    }
+
+    /// Also takes what was sent before we came, from publishers that keep it: those of rmw_zenoh do so where their
+    /// durability is transient local, and answer for it under `@adv` as zenoh's advanced publishers do.
+    fn subscribe_kept<M: Message>(&mut self, topic: &str, sample: fn(M) -> Sample) -> Result<(), Error> {
+        let arrivals = self.arrivals(sample);
+        self.listen(topic, &arrivals, rmw::QOS_KEPT)?;
+        let key = format!("{}/@adv/**", self.key::<M>(topic));
+        let (session, asked) = (self.session.clone(), key.clone());
+        let ask = move || {
+            let arrivals = Arc::clone(&arrivals);
+            let answers = move |reply: ::zenoh::query::Reply| {
+                if let Ok(came) = reply.result() {
+                    arrivals.take(came);
+                }
+            };
+            let query = session.get(&asked).target(QueryTarget::All).consolidation(ConsolidationMode::None);
+            query.accept_replies(ReplyKeyExpr::Any).callback(answers).wait()
+        };
+        ask().map_err(lost)?;
+        // And once more for each publisher that comes later, for it may have spoken before it saw us.
+        let appeared = move |came: ::zenoh::sample::Sample| {
+            if came.kind() == SampleKind::Put
+                && let Err(why) = ask()
+            {
+                tracing::debug!("what {} keeps was not asked for: {why}", came.key_expr());
+            }
+        };
+        let watching = self.session.liveliness().declare_subscriber(&key).callback(appeared).wait().map_err(lost)?;
+        self.subscribers.push(watching);
+        Ok(())
+    }
+
+    fn key<M: Message>(&self, topic: &str) -> String {
+        match &self.node {
             Some(node) => rmw::any_hash_key::<M>(node.domain, topic),
             None => rmw::plain_key(topic).to_owned(),
-        };
-        let arrivals = Arrivals::<M> {
+        }
+    }
+
+    fn arrivals<M: Message>(&self, sample: fn(M) -> Sample) -> Arc<Arrivals<M>> {
+        Arc::new(Arrivals {
             sender: self.sender.clone(),
             sample,
             hash: self.node.as_ref().map(|_| wire::type_hash::<M>()),
             told: AtomicBool::new(false),
-        };
+        })
+    }
+
+    fn listen<M: Message>(&mut self, topic: &str, arrivals: &Arc<Arrivals<M>>, qos: &str) -> Result<(), Error> {
+        let (key, arrivals) = (self.key::<M>(topic), Arc::clone(arrivals));
         let subscriber = self.session.declare_subscriber(&key).callback(move |came| arrivals.take(&came)).wait();
         self.subscribers.push(subscriber.map_err(|e| Error::Settings(format!("{topic} is no topic for zenoh: {e}")))?);
         if let Some(node) = &self.node {
             let id = self.tokens.len() as u64;
-            let token = node.endpoint_token::<M>(id, rmw::Endpoint::Subscription, topic, rmw::QOS_SENSOR);
+            let token = node.endpoint_token::<M>(id, rmw::Endpoint::Subscription, topic, qos);
             self.tokens.push(self.session.liveliness().declare_token(token).wait().map_err(lost)?);
         }
         Ok(())

@@ -86,6 +86,9 @@ pub enum Mount {
     Downward,
     /// Looks forward, the image's top is up.
     Forward,
+    /// As `/tf_static` has it: [`super::Odometer::standing_in`] names the body's frame, the calibration the camera's. The
+    /// camera's offset is taken from there too.
+    Tf,
     /// Rotation (x, y, z, w) that brings optical axes to body axes.
     Quaternion([f64; 4]),
 }

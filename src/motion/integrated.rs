@@ -53,6 +53,9 @@ pub enum NoFlow {
         /// Columns and rows of the frame.
         frame: [u32; 2],
     },
+    /// It is not known how the camera sits.
+    #[error("no transform from the camera's frame to the body's was received")]
+    Mount,
     /// The camera does not look there.
     #[error("what is straight below the body is not in the camera's sight")]
     OutOfSight,
@@ -125,6 +128,9 @@ impl Odometer {
     }
 
     fn plane(&mut self, flow: &Flow<'_>, camera_size: [u32; 2]) -> Result<Found, NoFlow> {
+        if !self.mounted {
+            return Err(NoFlow::Mount);
+        }
         let fits = |lens: &&Lens| lens.size() == [0, 0] || lens.size() == camera_size;
         let lens = self.lens.as_ref().filter(fits).ok_or(NoFlow::Calibration { frame: camera_size })?;
         self.below.look(flow, lens, self.config.confidence_min);

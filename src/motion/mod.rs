@@ -14,6 +14,7 @@ mod gyro;
 mod integrated;
 mod lens;
 mod linear;
+mod mounting;
 pub mod obstacles;
 mod odometer;
 mod quality;
@@ -115,6 +116,9 @@ pub enum Lack {
     /// No CameraInfo, or one that says "uncalibrated" (K[0] = 0).
     #[error("no calibration: CameraInfo is missing or has K[0] = 0")]
     Calibration,
+    /// The settings leave the camera's mount to the transforms, and none leads from the camera's frame to the body's.
+    #[error("no transform from the camera's frame to the body's was received")]
+    Mount,
     /// The calibration belongs to frames of another size.
     #[error("CameraInfo is for frames of {calibrated:?}, the frames are {frame:?} (columns, rows)")]
     CameraSize {
@@ -155,6 +159,7 @@ impl Lack {
         match self {
             Lack::Blind => "trustworthy flow",
             Lack::Calibration => "a calibration",
+            Lack::Mount => "a transform from camera to body",
             Lack::CameraSize { .. } => "a calibration for this frame size",
             Lack::Gyro => "a gyro",
             Lack::GyroGap { .. } => "a gyro over the whole interval",
@@ -173,7 +178,7 @@ pub enum Error {
     /// A value that is no number.
     #[error("{sensor} at {stamp}: {what} is not finite, the sample is refused")]
     NotFinite {
-        /// `gyro`, `range` or `calibration`.
+        /// `gyro`, `range`, `calibration` or `transform`.
         sensor: &'static str,
         /// The sample's stamp.
         stamp: Stamp,

@@ -10,13 +10,14 @@ use super::{
     gyro::{Rates, Turn},
     integrated::Below,
     lens::Lens,
+    mounting::Mounting,
     obstacles::Sighting,
     quality,
 };
 use crate::{
     clock::Stamp,
     flow::{Flow, Grid},
-    wire::{CameraInfo, Imu, Range},
+    wire::{CameraInfo, Imu, Range, TfMessage},
 };
 
 /// (rad/s)² of a body rate that nothing observed.
@@ -35,6 +36,9 @@ pub struct Odometer {
     pub(super) mount: Rotation3<f64>,
     beam: Vector3<f64>,
     pub(super) lens: Option<Lens>,
+    /// Where the transforms are to say how the camera sits, and whether they did.
+    mounting: Option<Mounting>,
+    pub(super) mounted: bool,
     /// Rays of the raster's cells, row by row, and the raster that they belong to: they change with the calibration only.
     rays: Vec<Option<[f64; 2]>>,
     rays_of: Option<Grid>,
@@ -80,6 +84,7 @@ impl Odometer {
         let mount = match config.camera {
             Mount::Downward => axes([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
             Mount::Forward => axes([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+            Mount::Tf => Rotation3::identity(),
             Mount::Quaternion(q) => unit("camera", q)?.to_rotation_matrix(),
         };
         let beam = Vector3::from(config.range_direction);
@@ -101,6 +106,8 @@ impl Odometer {
             mount,
             beam: beam.normalize(),
             lens: None,
+            mounting: (config.camera == Mount::Tf).then(Mounting::default),
+            mounted: config.camera != Mount::Tf,
             rays: Vec::new(),
             rays_of: None,
             rates: Rates::new(imu),
@@ -115,6 +122,14 @@ impl Odometer {
     /// For a camera whose stamps are the beginnings of exposures that last `exposure_s`.
     pub fn exposing(mut self, exposure_s: f64) -> Odometer {
         self.half_exposure_ns = (0.5e9 * exposure_s).round() as i64;
+        self
+    }
+
+    /// For a vehicle whose own frame has this name, where the transforms tell how the camera sits.
+    pub fn standing_in(mut self, body_frame: &str) -> Odometer {
+        if let Some(mounting) = &mut self.mounting {
+            mounting.body(body_frame);
+        }
         self
     }
 
@@ -135,7 +150,28 @@ impl Odometer {
             self.lens = lens;
             self.rays_of = None;
         }
+        if self.mounting.as_mut().is_some_and(|mounting| mounting.camera(&info.header.frame_id)) {
+            self.mount();
+        }
         Ok(())
+    }
+
+    /// Takes transforms; refuses those that are none, and takes the others of the same message.
+    pub fn transforms(&mut self, message: &TfMessage) -> Result<(), Error> {
+        let Some(mounting) = &mut self.mounting else { return Ok(()) };
+        let kept = mounting.keep(message);
+        self.mount();
+        kept
+    }
+
+    /// The camera sits as the transforms say by now.
+    fn mount(&mut self) {
+        let found = self.mounting.as_ref().and_then(Mounting::find);
+        self.mounted = found.is_some();
+        if let Some(stands) = found {
+            self.mount = stands.rotation.to_rotation_matrix();
+            self.config.camera_offset_m = stands.translation.vector.into();
+        }
     }
 
     /// Takes a gyro sample; refuses one that is not finite or whose clock went back.
@@ -172,9 +208,12 @@ impl Odometer {
         Ok(Velocity { older: flow.older, newer: flow.newer, ..velocity })
     }
 
-    /// The lens of frames of this size (columns, rows).
+    /// The lens of frames of this size (columns, rows), once it is known how it sits.
     pub(super) fn lens(&self, camera_size: [u32; 2]) -> Result<&Lens, Lack> {
         let lens = self.lens.as_ref().ok_or(Lack::Calibration)?;
+        if !self.mounted {
+            return Err(Lack::Mount);
+        }
         if lens.size() != [0, 0] && lens.size() != camera_size {
             return Err(Lack::CameraSize { calibrated: lens.size(), frame: camera_size });
         }

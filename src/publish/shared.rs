@@ -207,7 +207,7 @@ pub fn cause_code(state: &State) -> u32 {
 }
 
 /// [`VelocitySample::lack`]: 0 none, 1 blind, 2 calibration, 3 camera size, 4 gyro, 5 gyro gap, 6 disagreement,
-/// 7 degenerate.
+/// 7 degenerate, 8 mount.
 pub fn lack_code(velocity: &Result<Velocity, Lack>) -> u32 {
     velocity.as_ref().err().map_or(0, code)
 }
@@ -221,6 +221,7 @@ fn code(lack: &Lack) -> u32 {
         Lack::GyroGap { .. } => 5,
         Lack::Disagreement { .. } => 6,
         Lack::Degenerate => 7,
+        Lack::Mount => 8,
     }
 }
 
@@ -231,7 +232,7 @@ pub fn cause_name(code: u32) -> &'static str {
 
 /// What a code of [`VelocitySample::lack`] stands for.
 pub fn lack_name(code: u32) -> &'static str {
-    ["", "blind", "calibration", "camera size", "gyro", "gyro gap", "disagreement", "degenerate"]
+    ["", "blind", "calibration", "camera size", "gyro", "gyro gap", "disagreement", "degenerate", "mount"]
         .get(code as usize)
         .copied()
         .unwrap_or("unknown")

@@ -22,6 +22,7 @@ pub(super) struct Topics {
     info: String,
     imu: String,
     range: String,
+    transforms: String,
     step: String,
     ego_motion: String,
     velocity: String,
@@ -39,6 +40,7 @@ impl Topics {
             info: cameras.info_topic.clone(),
             imu: cameras.imu_topic.clone(),
             range: cameras.range_topic.clone(),
+            transforms: cameras.tf_topic.clone(),
             step: under("step"),
             ego_motion: under("ego_motion"),
             velocity: under("velocity"),
@@ -93,6 +95,7 @@ impl Pen {
             Sample::Info(info) => put(writer, &self.topics.info, lost, time, stamp, &**info),
             Sample::Imu(imu) => put(writer, &self.topics.imu, lost, time, stamp, &**imu),
             Sample::Range(range) => put(writer, &self.topics.range, lost, time, stamp, &**range),
+            Sample::Transforms(message) => put(writer, &self.topics.transforms, lost, time, stamp, &**message),
         }
     }
 

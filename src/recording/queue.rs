@@ -67,6 +67,7 @@ impl Item {
             Item::Sample(Sample::Range(_)) => 3,
             Item::Step(_) => 4,
             Item::Status(_) => 5,
+            Item::Sample(Sample::Transforms(_)) => 6,
         }
     }
 }
@@ -83,7 +84,7 @@ pub(super) struct Popped {
 struct Waiting {
     items: VecDeque<(Item, u32)>,
     large: usize,
-    lost: [u32; 6],
+    lost: [u32; 7],
     // They travel in items as boxes; unboxing them here would only copy them.
     #[allow(clippy::vec_box)]
     spare: Vec<Box<StepItem>>,

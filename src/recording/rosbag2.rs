@@ -10,13 +10,15 @@ const VERSION: u32 = 9;
 
 /// Images, gyro and range keep what sensors offer; all else is small or rare enough to be offered reliably.
 pub(super) fn offered_qos(definition: &str) -> String {
-    let (depth, reliability) = match definition {
-        "sensor_msgs/msg/Image" | "sensor_msgs/msg/Imu" | "sensor_msgs/msg/Range" => (5, "best_effort"),
-        _ => (10, "reliable"),
+    let (depth, reliability, durability) = match definition {
+        "sensor_msgs/msg/Image" | "sensor_msgs/msg/Imu" | "sensor_msgs/msg/Range" => (5, "best_effort", "volatile"),
+        // Who comes late must hear it too.
+        "tf2_msgs/msg/TFMessage" => (100, "reliable", "transient_local"),
+        _ => (10, "reliable", "volatile"),
     };
     let forever = |name: &str| format!("  {name}:\n    sec: 9223372036\n    nsec: 854775807\n");
     format!(
-        "- history: keep_last\n  depth: {depth}\n  reliability: {reliability}\n  durability: volatile\n{}{}  \
+        "- history: keep_last\n  depth: {depth}\n  reliability: {reliability}\n  durability: {durability}\n{}{}  \
          liveliness: automatic\n{}  avoid_ros_namespace_conventions: false\n",
         forever("deadline"),
         forever("lifespan"),
@@ -86,7 +88,11 @@ mod tests {
     #[test]
     fn sensors_are_best_effort_and_our_own_reliable() {
         assert!(offered_qos("sensor_msgs/msg/Image").contains("depth: 5\n  reliability: best_effort\n"));
-        assert!(offered_qos("nightflow_msgs/msg/Step").contains("depth: 10\n  reliability: reliable\n"));
+        assert!(
+            offered_qos("nightflow_msgs/msg/Step")
+                .contains("depth: 10\n  reliability: reliable\n  durability: volatile")
+        );
+        assert!(offered_qos("tf2_msgs/msg/TFMessage").contains("durability: transient_local\n"));
     }
 
     #[test]

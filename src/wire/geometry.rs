@@ -104,3 +104,31 @@ impl Message for TwistWithCovarianceStamped {
     const PACKAGE: &'static str = "geometry_msgs";
     const NAME: &'static str = "TwistWithCovarianceStamped";
 }
+
+/// `geometry_msgs/Transform`: brings points of the child frame into the parent frame.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[allow(missing_docs)]
+pub struct Transform {
+    /// Metres.
+    pub translation: Vector3,
+    pub rotation: Quaternion,
+}
+
+impl Message for Transform {
+    const PACKAGE: &'static str = "geometry_msgs";
+    const NAME: &'static str = "Transform";
+}
+
+/// `geometry_msgs/TransformStamped`: the header names the parent frame.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[allow(missing_docs)]
+pub struct TransformStamped {
+    pub header: Header,
+    pub child_frame_id: String,
+    pub transform: Transform,
+}
+
+impl Message for TransformStamped {
+    const PACKAGE: &'static str = "geometry_msgs";
+    const NAME: &'static str = "TransformStamped";
+}

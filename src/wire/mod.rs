@@ -11,18 +11,21 @@ mod px4;
 pub mod rmw;
 mod sensor;
 mod standard;
+mod tf2;
 
 use std::{collections::HashMap, sync::OnceLock};
 
 pub use definitions::Definitions;
 pub use diagnostic::{DiagnosticArray, DiagnosticStatus, KeyValue};
 pub use geometry::{
-    Quaternion, Twist, TwistStamped, TwistWithCovariance, TwistWithCovarianceStamped, Vector3, Vector3Stamped,
+    Quaternion, Transform, TransformStamped, Twist, TwistStamped, TwistWithCovariance, TwistWithCovarianceStamped,
+    Vector3, Vector3Stamped,
 };
 pub use nightflow::{EgoMotion, Status, Step};
 pub use px4::{ObstacleDistance, SensorOpticalFlow, VehicleOpticalFlow};
 pub use sensor::{CameraInfo, CompressedImage, Image, Imu, LaserScan, Range, RegionOfInterest};
 pub use standard::{Header, Time};
+pub use tf2::TfMessage;
 
 /// A ROS 2 message: its name, and by serde its CDR form.
 pub trait Message: serde::Serialize + serde::de::DeserializeOwned + Send + Sync + 'static {
@@ -138,14 +141,15 @@ macro_rules! texts {
     };
 }
 
-const TEXTS: [(&str, &str); 25] = texts! {
+const TEXTS: [(&str, &str); 28] = texts! {
     "" "nightflow_msgs": "EgoMotion" "Status" "Step";
     "px4_msgs/" "px4_msgs": "ObstacleDistance" "SensorOpticalFlow" "VehicleOpticalFlow";
     "standard/builtin_interfaces/" "builtin_interfaces": "Time";
     "standard/diagnostic_msgs/" "diagnostic_msgs": "DiagnosticArray" "DiagnosticStatus" "KeyValue";
-    "standard/geometry_msgs/" "geometry_msgs": "Quaternion" "Twist" "TwistStamped" "TwistWithCovariance"
+    "standard/geometry_msgs/" "geometry_msgs": "Quaternion" "Transform" "TransformStamped" "Twist" "TwistStamped" "TwistWithCovariance"
         "TwistWithCovarianceStamped" "Vector3" "Vector3Stamped";
     "standard/sensor_msgs/" "sensor_msgs": "CameraInfo" "CompressedImage" "Image" "Imu" "LaserScan" "Range"
         "RegionOfInterest";
     "standard/std_msgs/" "std_msgs": "Header";
+    "standard/tf2_msgs/" "tf2_msgs": "TFMessage";
 };

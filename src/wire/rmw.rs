@@ -9,6 +9,8 @@ pub const ATTACHMENT_BYTES: usize = 33;
 pub const QOS_RELIABLE: &str = "::,10:,:,:,,";
 /// Best effort, volatile, keep the last five: what readers of sensors ask for.
 pub const QOS_SENSOR: &str = "2::,5:,:,:,,";
+/// Reliable, transient local, keep the last hundred: what readers of `/tf_static` ask for.
+pub const QOS_KEPT: &str = ":1:,100:,:,:,,";
 
 /// A plain key: the topic without its first slash.
 pub fn plain_key(topic: &str) -> &str {

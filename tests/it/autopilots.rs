@@ -1,6 +1,6 @@
 //! What autopilots are told: signs and axes by PX4's own rules, read back by the peers that they speak with.
 
-mod moves;
+pub mod moves;
 
 use std::{
     ffi::OsStr,

@@ -15,6 +15,7 @@ mod latest;
 mod launch_configs;
 mod live;
 mod motion;
+mod mounting;
 mod noise;
 mod noise_command;
 mod noise_node;

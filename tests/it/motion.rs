@@ -59,6 +59,7 @@ impl Truth {
             Mount::Forward => {
                 Rotation3::from_matrix_unchecked(nalgebra::Matrix3::new(0., 0., 1., -1., 0., 0., 0., -1., 0.))
             }
+            Mount::Tf => panic!("no transforms here"),
             Mount::Quaternion([x, y, z, w]) => {
                 UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(w, x, y, z)).to_rotation_matrix()
             }

@@ -7,8 +7,8 @@ use std::{collections::BTreeSet, path::Path, time::Duration};
 use nightflow::wire::{
     self, CameraInfo, CompressedImage, Definitions, DiagnosticArray, DiagnosticStatus, EgoMotion, Header, Image, Imu,
     KeyValue, LaserScan, Message, ObstacleDistance, Quaternion, Range, RegionOfInterest, SensorOpticalFlow, Status,
-    Step, Time, Twist, TwistStamped, TwistWithCovariance, TwistWithCovarianceStamped, Vector3, Vector3Stamped,
-    VehicleOpticalFlow,
+    Step, TfMessage, Time, Transform, TransformStamped, Twist, TwistStamped, TwistWithCovariance,
+    TwistWithCovarianceStamped, Vector3, Vector3Stamped, VehicleOpticalFlow,
     definition::{Base, Count, Definition},
 };
 use proptest::{prelude::*, strategy::ValueTree, test_runner::TestRunner};
@@ -23,7 +23,7 @@ macro_rules! for_every_message {
             Time, Header, Image, CompressedImage, CameraInfo, RegionOfInterest, Imu, Range, LaserScan, Vector3,
             Vector3Stamped, Quaternion, Twist, TwistStamped, TwistWithCovariance, TwistWithCovarianceStamped, KeyValue,
             DiagnosticStatus, DiagnosticArray, Step, EgoMotion, Status, SensorOpticalFlow, VehicleOpticalFlow,
-            ObstacleDistance)
+            ObstacleDistance, Transform, TransformStamped, TfMessage)
     };
     (@each $check:ident $arguments:tt $($message:ty),*) => { $(for_every_message!(@one $check $arguments $message);)* };
     (@one $check:ident ($($argument:expr),*) $message:ty) => { $check::<$message>($($argument),*) };

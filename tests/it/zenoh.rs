@@ -101,7 +101,7 @@ fn the_ros_graph_shows_the_node_and_its_subscriptions() {
     let (_source, camera, tokens) = meet("rmw", [64, 48]);
     let kinds: Vec<&str> = tokens.iter().map(|token| token.split('/').nth(5).unwrap()).collect();
     assert_eq!(kinds.iter().filter(|kind| **kind == "NN").count(), 1, "{tokens:?}");
-    assert_eq!(kinds.iter().filter(|kind| **kind == "MS").count(), 4, "{tokens:?}");
+    assert_eq!(kinds.iter().filter(|kind| **kind == "MS").count(), 5, "{tokens:?}");
     assert!(tokens.iter().any(|token| token.ends_with("/NN/%/%/nightflow_camera")), "{tokens:?}");
     let image = format!("image/sensor_msgs::msg::dds_::Image_/{}/2::,5:,:,:,,", wire::type_hash::<wire::Image>());
     assert!(tokens.iter().any(|token| token.ends_with(&image)), "{tokens:?}");

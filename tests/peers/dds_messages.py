@@ -76,6 +76,24 @@ class Quaternion(IdlStruct, typename=named("geometry_msgs", "Quaternion")):
 
 
 @dataclass
+class Transform(IdlStruct, typename=named("geometry_msgs", "Transform")):
+    translation: Vector3
+    rotation: Quaternion
+
+
+@dataclass
+class TransformStamped(IdlStruct, typename=named("geometry_msgs", "TransformStamped")):
+    header: Header
+    child_frame_id: str
+    transform: Transform
+
+
+@dataclass
+class TFMessage(IdlStruct, typename=named("tf2_msgs", "TFMessage")):
+    transforms: t.sequence[TransformStamped]
+
+
+@dataclass
 class Imu(IdlStruct, typename=named("sensor_msgs", "Imu")):
     header: Header
     orientation: Quaternion

@@ -59,7 +59,9 @@ with open(path, "rb") as file:
             assert bag["message_count"] == summary.statistics.message_count, bag
             assert bag["relative_file_paths"] == [path.name], bag
             for topic in bag["topics_with_message_count"]:
-                assert YAML(typ="safe").load(topic["topic_metadata"]["offered_qos_profiles"])[0]["durability"] == "volatile"
+                about = topic["topic_metadata"]
+                durability = "transient_local" if about["type"] == "tf2_msgs/msg/TFMessage" else "volatile"
+                assert YAML(typ="safe").load(about["offered_qos_profiles"])[0]["durability"] == durability
     for _, channel, message, decoded in reader.iter_decoded_messages(log_time_order=False):
         print("message mcap", channel.topic, message.log_time, message.publish_time, *flat(decoded))
 

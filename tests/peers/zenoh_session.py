@@ -7,13 +7,15 @@ import zenoh
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 
-def open_session(role, endpoint, shared_memory=True):
+def open_session(role, endpoint, shared_memory=True, stamped=False):
     config = zenoh.Config()
     config.insert_json5("mode", '"peer"')
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("listen/endpoints", "[]")
     config.insert_json5(f"{role}/endpoints", json.dumps([endpoint]))
     config.insert_json5("transport/shared_memory/enabled", "true" if shared_memory else "false")
+    if stamped:
+        config.insert_json5("timestamping/enabled", "true")
     return zenoh.open(config)
 
 
