@@ -11,7 +11,7 @@ use crate::{
     clock::{self, Laps, Reservoir, Stage, Stopwatch},
     exposure::Noise,
     flow::{Flow, Lender, Own, State},
-    motion::{Diagnosis, Scale},
+    motion::{Diagnosis, NoSight, Scale, Sector},
     pipeline::{Outcome, Pipeline},
     publish::{self, Moved, Offer, Sink, iceoryx2::SharedSink},
     wire,
@@ -132,6 +132,10 @@ pub struct Report {
     pub latency_ms: Reservoir,
     /// Metric speeds, m/s.
     pub speeds: Reservoir,
+    /// Steps that looked for obstacles, those that saw one in the way, and steps that could not look.
+    pub sights: [u64; 3],
+    /// The least time to contact of all steps, s.
+    pub nearest_s: Option<f64>,
     /// State of the newest step.
     pub state: State,
     /// What camera and gyro disagree on.
@@ -172,8 +176,26 @@ impl Report {
             Ok(_) => *self.lacks.entry("a range: velocity is per distance".into()).or_default() += 1,
             Err(lack) => *self.lacks.entry(lack.kind().into()).or_default() += 1,
         }
+        self.looked(moved);
         self.state = moved.state.clone();
         self.noise = moved.noise.map(|noise| (noise, moved.raw_mean, moved.noise_level.unwrap_or(f32::NAN)));
+    }
+
+    fn looked(&mut self, moved: &Moved) {
+        let found = match &moved.obstacles {
+            Err(NoSight::Off) => return,
+            Err(_) => return self.sights[2] += 1,
+            Ok(found) => found,
+        };
+        self.sights[0] += 1;
+        let times = found.sectors.iter().filter_map(|sector| match sector {
+            Sector::Occupied { ttc_s, .. } => Some(*ttc_s),
+            _ => None,
+        });
+        if let Some(nearest) = times.min_by(f64::total_cmp) {
+            self.sights[1] += 1;
+            self.nearest_s = Some(self.nearest_s.map_or(nearest, |least| least.min(nearest)));
+        }
     }
 
     fn status(&self, since: &Cadence) -> wire::Status {

@@ -238,6 +238,16 @@ pub fn lack_name(code: u32) -> &'static str {
         .unwrap_or("unknown")
 }
 
+/// What a code of [`ObstaclesSample::sight`] stands for.
+pub fn sight_name(code: u32) -> &'static str {
+    match code {
+        64 => "not asked for",
+        65 => "bare",
+        66 => "no parallax",
+        lack => lack_name(lack),
+    }
+}
+
 fn state_code(state: &State) -> u32 {
     match state {
         State::Ok => 0,

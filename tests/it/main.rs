@@ -3,7 +3,6 @@
 
 mod allocations;
 mod autopilots;
-mod avoid;
 mod bags;
 mod darkness;
 mod eval;
@@ -22,6 +21,7 @@ mod noise_command;
 mod noise_node;
 mod obstacles;
 mod onnx_bytes;
+mod outliers;
 mod peers;
 mod recording;
 mod recordings;

@@ -13,34 +13,34 @@ use nightflow::{
 };
 
 const SIZE: [u32; 2] = [640, 480];
-const FOCAL: f64 = 420.0;
+pub const FOCAL: f64 = 420.0;
 const OLDER_NS: i64 = 10_000_000_000;
-const GRID: Grid = Grid { width: 80, height: 60, scale: [8.0, 8.0] };
+pub const GRID: Grid = Grid { width: 80, height: 60, scale: [8.0, 8.0] };
 
 /// One step over the plane z = 0 of the world, with everything that is true about it.
 #[derive(Clone)]
-struct Truth {
-    config: Config,
+pub struct Truth {
+    pub config: Config,
     /// Body velocity in the older body's axes; straight in the world.
-    velocity: Vector3<f64>,
+    pub velocity: Vector3<f64>,
     rates: Vector3<f64>,
     /// Height of the body's origin.
     height: f64,
     /// World from older body.
-    attitude: UnitQuaternion<f64>,
+    pub attitude: UnitQuaternion<f64>,
     interval_s: f64,
 }
 
 /// What the sensors make of it.
-struct Seen {
-    vectors: Vec<f32>,
-    confidence: Vec<f32>,
+pub struct Seen {
+    pub vectors: Vec<f32>,
+    pub confidence: Vec<f32>,
     rates: Vector3<f64>,
     range: f64,
 }
 
 impl Truth {
-    fn hovering(height: f64) -> Self {
+    pub fn hovering(height: f64) -> Self {
         Self {
             config: Config { stamp_jitter_sd_s: 0.0, gyro_offset_sd_s: 0.0, ..Config::default() },
             velocity: Vector3::zeros(),
@@ -74,12 +74,12 @@ impl Truth {
     }
 
     /// The velocity in the newer body's axes, which is what is asked for.
-    fn expected(&self) -> Vector3<f64> {
+    pub fn expected(&self) -> Vector3<f64> {
         self.newer().1.inverse() * (self.attitude * self.velocity)
     }
 
     /// Exact flow of a pinhole camera; where the ground is not in sight it is left out by its confidence.
-    fn exact(&self) -> Seen {
+    pub fn exact(&self) -> Seen {
         let offset = Vector3::from(self.config.camera_offset_m);
         let (newer, turned) = self.newer();
         let older = Vector3::new(0.0, 0.0, self.height);
@@ -123,7 +123,7 @@ impl Truth {
         OLDER_NS + (self.interval_s * 1e9).round() as i64
     }
 
-    fn velocity(&self, seen: &Seen, range: bool) -> Result<Velocity, Lack> {
+    pub fn velocity(&self, seen: &Seen, range: bool) -> Result<Velocity, Lack> {
         let gyro = (-4..12).map(|k| OLDER_NS + 1_234_567 + k * 5_000_000);
         self.odometer(seen, gyro, range).velocity(&self.flow(seen), SIZE)
     }

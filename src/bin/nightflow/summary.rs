@@ -58,6 +58,14 @@ impl fmt::Display for Summary<'_> {
         for (lack, count) in &report.lacks {
             writeln!(f, "                        {count} steps lacked {lack}")?;
         }
+        let [looked, occupied, not] = report.sights;
+        if looked + not > 0 {
+            write!(f, "obstacles     {occupied:>7}   of {looked} steps saw something in the way")?;
+            if let Some(least) = report.nearest_s {
+                write!(f, ", the nearest in {least:.2} s")?;
+            }
+            writeln!(f, "; {not} could not look")?;
+        }
         for output in &self.outputs {
             writeln!(f, "written                 {output}")?;
         }

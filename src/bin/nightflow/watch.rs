@@ -19,7 +19,7 @@ use nightflow::{
     clock::{self, Reservoir},
     publish::{
         iceoryx2::service_name,
-        shared::{FlowHeader, StatusSample, VelocitySample, cause_name, lack_name},
+        shared::{FlowHeader, ObstaclesSample, StatusSample, VelocitySample, cause_name, lack_name, sight_name},
     },
 };
 
@@ -104,6 +104,7 @@ type Reader<T> = Subscriber<Service, T, ()>;
 struct Attached {
     flow: Subscriber<Service, [f32], FlowHeader>,
     velocity: Reader<VelocitySample>,
+    obstacles: Reader<ObstaclesSample>,
     status: Reader<StatusSample>,
     wake: Listener<Service>,
     publishers: Box<dyn Fn() -> usize>,
@@ -119,6 +120,9 @@ impl Attached {
         while let Some(sample) = self.velocity.receive()? {
             view.velocities.truncate(VELOCITIES - 1);
             view.velocities.push_front(*sample.payload());
+        }
+        while let Some(sample) = self.obstacles.receive()? {
+            view.obstacles = Some(*sample.payload());
         }
         while let Some(sample) = self.status.receive()? {
             view.status = Some(*sample.payload());
@@ -161,11 +165,13 @@ fn try_attach(node: &Node<Service>, prefix: &str) -> anyhow::Result<Attached> {
     let service = node.service_builder(&name).publish_subscribe::<[f32]>().user_header::<FlowHeader>().open()?;
     // The flow is sent last, so it is attached to last: who gets it gets all else of its step.
     let (velocity, status) = (reader(node, prefix, "velocity")?, reader(node, prefix, "status")?);
+    let obstacles = reader(node, prefix, "obstacles")?;
     let wake = node.service_builder(&name).event().open()?.listener_builder().create()?;
     let flow = service.subscriber_builder().create()?;
     Ok(Attached {
         flow,
         velocity,
+        obstacles,
         status,
         wake,
         publishers: Box::new(move || service.dynamic_config().number_of_publishers()),
@@ -194,6 +200,7 @@ struct View {
     arrivals: VecDeque<Instant>,
     /// The newest first.
     velocities: VecDeque<VelocitySample>,
+    obstacles: Option<ObstaclesSample>,
     status: Option<StatusSample>,
     drawn: usize,
 }
@@ -248,6 +255,23 @@ impl View {
         }
     }
 
+    /// The nearest thing in the way; none where nobody looks for any.
+    fn ahead(&self) -> Option<String> {
+        let found = self.obstacles.as_ref().filter(|found| found.sight != 64)?;
+        if found.valid == 0 {
+            return Some(format!("unknown ({})", sight_name(found.sight)));
+        }
+        let count = |kind: u8| found.sector.iter().filter(|sector| **sector == kind).count();
+        let near = (0..found.sector.len()).filter(|k| found.sector[*k] == 2);
+        let near = near.min_by(|a, b| found.ttc_s[*a].total_cmp(&found.ttc_s[*b]));
+        let near = near.map_or("nothing near".into(), |k| {
+            let (ttc, distance) = (found.ttc_s[k], found.distance_m[k]);
+            let metres = if distance.is_nan() { String::new() } else { format!(" at {distance:.1} m") };
+            format!("in {ttc:.2} s{metres}, {:+.0}° to the left", 360.0 * k as f64 / found.sector.len() as f64 - 180.0)
+        });
+        Some(format!("{near}; {} sectors occupied, {} free, {} unknown", count(2), count(1), count(0)))
+    }
+
     fn status(&self) -> String {
         match &self.status {
             None => "it sent no status".into(),
@@ -291,6 +315,7 @@ impl View {
             format!("latency   {p50:.0} µs from sending, p99 {p99:.0}; {:.1} ms from the frame's stamp", self.age_ms),
             format!("lost      {} displaced frames, {} steps not sent", header.displaced, header.lost),
         ];
+        lines.extend(self.ahead().map(|ahead| format!("obstacles {ahead}")));
         if self.steps == 0 || silent > SILENCE {
             lines.push(format!("silent    for {:.0} s; {}", silent.as_secs_f64(), self.status()));
         }

@@ -97,13 +97,15 @@ impl Cell {
         let (shift, pull) = (self.shift(), self.pull(&t));
         let (length, ray) = (pull.norm(), Vector3::new(self.newer[0], self.newer[1], 1.0));
         let ahead = ray.dot(&t);
-        self.known = self.seen && length > 1e-6 && ahead > AHEAD_MIN;
+        let along = pull / length;
+        let shown_px = texture::sd_along(self.texture, along.into());
+        // Where the texture runs along the line, a network fills the vector in from elsewhere.
+        self.known = self.seen && length > 1e-6 && ahead > AHEAD_MIN && shown_px <= scene.config.texture_sd_px_max;
         if !self.known {
             return;
         }
-        let along = pull / length;
         let stated = heading.spread / self.weight.sqrt();
-        let shown = texture::sd_along(self.texture, along.into()) * scene.pixel;
+        let shown = shown_px * scene.pixel;
         let across = texture::sd_along(self.texture, [-along.y, along.x]) * scene.pixel;
         let sd = hypot(stated, shown);
         self.off = self.residual(&t);
