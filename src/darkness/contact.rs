@@ -18,6 +18,8 @@ use super::{
 pub const SECTORS: usize = 72;
 /// Things count that reach to within so many metres of the drone's height.
 pub const BAND_M: f64 = 1.0;
+/// What nears more slowly than this does not near, m/s.
+const STILL: f64 = 1e-3;
 
 /// Where the middle of a sector lies, radians counter-clockwise from straight ahead, in the level body frame.
 pub fn bearing(sector: usize) -> f64 {
@@ -74,7 +76,9 @@ impl Site<'_> {
                     for corner in corners {
                         distance = distance.min(corner.xy().norm());
                         let nears = corner.dot(&closing);
-                        ttc = if nears > 0.0 { ttc.min(nears / closing.norm_squared()) } else { ttc };
+                        if nears > 0.0 && closing.norm() > STILL {
+                            ttc = ttc.min(nears / closing.norm_squared());
+                        }
                     }
                 }
             }

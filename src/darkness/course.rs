@@ -101,6 +101,13 @@ impl Thing {
         Thing::still([x - half, -REACH_M, height - half], [x + half, REACH_M, height + half])
     }
 
+    /// The same, so many metres wide across the track, with its middle on it.
+    pub fn wide(self, metres: f64) -> Thing {
+        let Thing { mut low, mut high, .. } = self;
+        (low[1], high[1]) = (-0.5 * metres, 0.5 * metres);
+        Thing { low, high, ..self }
+    }
+
     /// The same, moving.
     pub fn moving(self, velocity: [f64; 3]) -> Thing {
         Thing { velocity, ..self }

@@ -3,6 +3,7 @@
 
 mod allocations;
 mod autopilots;
+mod avoid;
 mod bags;
 mod darkness;
 mod eval;
