@@ -157,9 +157,11 @@ pub struct Obstacles {
 impl Obstacles {
     /// Subscribes to the node with this prefix.
     pub fn open(prefix: &str) -> Result<Obstacles, Box<dyn Error>> {
+        set_log_level_from_env_or(LogLevel::Error);
         let node = NodeBuilder::new().create::<ipc::Service>()?;
         let name: ServiceName = format!("{prefix}/obstacles").as_str().try_into()?;
-        let samples = node.service_builder(&name).publish_subscribe::<ObstaclesSample>().open()?;
+        let samples = node.service_builder(&name).publish_subscribe::<ObstaclesSample>().open();
+        let samples = samples.map_err(|error| format!("{name} can't be opened, does a node run there? {error:?}"))?;
         let samples = samples.subscriber_builder().create()?;
         let name: ServiceName = format!("{prefix}/flow").as_str().try_into()?;
         let wake = node.service_builder(&name).event().open()?.listener_builder().create()?;
