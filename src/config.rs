@@ -4,7 +4,14 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::{camera, exposure, flow, motion, publish, recording};
+use crate::{
+    camera, exposure, flow, motion,
+    publish::{
+        self,
+        autopilot::{Word, px4::Topic},
+    },
+    recording,
+};
 
 /// Everything that can be set. `nightflow config` prints the effective whole with the reason of every value.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -45,6 +52,19 @@ pub enum Error {
         /// The nearest name that exists, if one is near.
         hint: String,
     },
+    /// An autopilot is to be told of what nobody looks for.
+    #[error(
+        "configuration {path}: {key} names {word}, and nobody looks for obstacles: add a table [motion.obstacles]",
+        path = path.display()
+    )]
+    NoLookout {
+        /// The file.
+        path: PathBuf,
+        /// The setting.
+        key: &'static str,
+        /// What it names.
+        word: &'static str,
+    },
     /// The settings can't be written as TOML.
     #[error("the configuration can't be written: {0}")]
     Unwritable(#[from] toml::ser::Error),
@@ -59,11 +79,28 @@ impl Config {
 
     /// Reads the text of a launch file; `path` is for messages only.
     pub fn parse(text: &str, path: &Path) -> Result<Self, Error> {
-        toml::from_str(text).map_err(|error| {
+        let config: Self = toml::from_str(text).map_err(|error| {
             let reason = error.to_string();
             let hint = nearest(&reason).map(|name| format!("did you mean `{name}`?")).unwrap_or_default();
             Error::Invalid { path: path.into(), reason, hint }
-        })
+        })?;
+        match config.unlooked() {
+            Some((key, word)) => Err(Error::NoLookout { path: path.into(), key, word }),
+            None => Ok(config),
+        }
+    }
+
+    /// What asks for obstacles though nobody looks for them: the setting, and what it names.
+    fn unlooked(&self) -> Option<(&'static str, &'static str)> {
+        let publish::Config { mavlink, px4, .. } = &self.publish;
+        if self.motion.obstacles.is_some() {
+            return None;
+        }
+        if mavlink.as_ref().is_some_and(|mavlink| mavlink.words.contains(&Word::Obstacles)) {
+            return Some(("publish.mavlink.words", "obstacles"));
+        }
+        let px4 = px4.as_ref().is_some_and(|px4| px4.topics.contains(&Topic::ObstacleDistance));
+        px4.then_some(("publish.px4.topics", "obstacle_distance"))
     }
 
     /// The whole configuration as TOML that reads back to the same.
@@ -152,6 +189,19 @@ mod tests {
         let text = Config::default().explained().unwrap();
         let bare: Vec<&str> = text.lines().filter(|line| line.contains(" = ") && !line.contains(" # ")).collect();
         assert!(bare.is_empty(), "no reason is given for:\n{}", bare.join("\n"));
+    }
+
+    #[test]
+    fn what_tells_of_obstacles_needs_somebody_who_looks_for_them() {
+        for (lines, key) in [
+            ("[publish.mavlink]\nwords = [\"flow\", \"obstacles\"]\n", "publish.mavlink.words names obstacles"),
+            ("[publish.px4]\ntopics = [\"obstacle_distance\"]\n", "publish.px4.topics names obstacle_distance"),
+        ] {
+            let error = Config::parse(lines, Path::new("ahead.toml")).unwrap_err().to_string();
+            assert!(error.contains("ahead.toml") && error.contains(key), "{error}");
+            assert!(error.contains("[motion.obstacles]"), "{error}");
+            Config::parse(&format!("{lines}[motion.obstacles]\n"), Path::new("ahead.toml")).unwrap();
+        }
     }
 
     #[test]

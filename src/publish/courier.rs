@@ -12,11 +12,9 @@ use std::{
 use super::{
     Config, Error, Offer, Sink,
     outgoing::{self, Kept},
+    pace::Pace,
 };
-use crate::{
-    clock::Stamp,
-    wire::{DiagnosticArray, EgoMotion, Image, LaserScan, Status, Step, TwistWithCovarianceStamped},
-};
+use crate::wire::{DiagnosticArray, EgoMotion, Image, LaserScan, Status, Step, TwistWithCovarianceStamped};
 
 /// Steps that may wait for the network: a quarter of a second at 30 Hz, for results older than that help nobody.
 const STEPS_MAX: usize = 8;
@@ -75,7 +73,7 @@ impl Topics {
 pub struct Courier {
     name: &'static str,
     body_frame: String,
-    images: Pace,
+    images: Option<Pace>,
     orders: Option<SyncSender<Order>>,
     /// Parcels come back here, so that a step allocates nothing.
     spare: Receiver<Box<Parcel>>,
@@ -120,7 +118,7 @@ impl Courier {
         Ok(Self {
             name,
             body_frame: config.body_frame.clone(),
-            images: Pace::new(config.image_hz_max),
+            images: (config.image_hz_max > 0.0).then(|| Pace::new(config.image_hz_max)),
             orders: Some(orders),
             spare,
             lost: 0,
@@ -157,7 +155,7 @@ impl Sink for Courier {
         parcel.has_velocity = outgoing::fill_twist(moved, &self.body_frame, &mut parcel.velocity);
         parcel.has_motion = outgoing::fill_ego_motion(moved, &self.body_frame, &mut parcel.motion);
         parcel.has_proximity = outgoing::fill_proximity(moved, &self.body_frame, &mut parcel.proximity);
-        parcel.has_flow = self.images.due(moved.newer);
+        parcel.has_flow = self.images.as_mut().is_some_and(|images| images.lets(moved.newer));
         if parcel.has_flow {
             parcel.flow.keep(offer);
         }
@@ -260,49 +258,18 @@ impl<N: Network> Round<N> {
     }
 }
 
-/// Lets images through at most so often, by the frames' own stamps.
-struct Pace {
-    interval_s: f64,
-    last: Option<Stamp>,
-}
-
-impl Pace {
-    fn new(hz_max: f64) -> Self {
-        Self { interval_s: if hz_max > 0.0 { 1.0 / hz_max } else { f64::INFINITY }, last: None }
-    }
-
-    fn due(&mut self, stamp: Stamp) -> bool {
-        // Stamps that go back are a camera that started anew. A microsecond's leeway keeps 30 Hz at 10 from being 7.5.
-        let due = self.interval_s.is_finite()
-            && self.last.is_none_or(|last| stamp < last || stamp.seconds_since(last) + 1e-6 >= self.interval_s);
-        if due {
-            self.last = Some(stamp);
-        }
-        due
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use std::sync::mpsc;
 
     use super::*;
     use crate::{
+        clock::Stamp,
         exposure::Exposed,
         flow,
         motion::{Integrated, Lack, NoFlow, NoSight},
         publish::Moved,
     };
-
-    #[test]
-    fn images_keep_the_pace_of_the_stamps() {
-        let mut pace = Pace::new(10.0);
-        let passed: Vec<i64> = (0..13).map(|i| i * 33_333_333).filter(|ns| pace.due(Stamp::from_ns(*ns))).collect();
-        assert_eq!(passed, [0, 99_999_999, 199_999_998, 299_999_997, 399_999_996]);
-        assert!(pace.due(Stamp::from_ns(5)), "the camera started anew");
-        let mut none = Pace::new(0.0);
-        assert!(!none.due(Stamp::from_ns(0)) && !none.due(Stamp::from_ns(i64::MAX)));
-    }
 
     /// A network that stands still until it is told to go on.
     struct Stuck {

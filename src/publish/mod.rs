@@ -4,6 +4,7 @@ pub mod autopilot;
 pub mod courier;
 pub mod iceoryx2;
 pub mod outgoing;
+mod pace;
 pub mod paint;
 pub mod pictures;
 mod plot;
@@ -216,6 +217,11 @@ pub const REASONS: &[(&str, &str)] = &[
     ("mavlink.component", "197: what MAVLink calls a camera's odometry"),
     ("mavlink.sensor", "0: the first, and there is only one"),
     ("mavlink.hz", "0: every step, as long as the line has room for it"),
+    ("mavlink.obstacles_hz", "10: what autopilots ask for, and 179 bytes each are a third of a line of 57,600 baud"),
+    (
+        "mavlink.obstacles_m_max",
+        "15: as far as ArduPilot's BendyRuler looks; 7 m/s can be braked in 10 m, and from 2 m/s on 8 s reach that far",
+    ),
     (
         "mavlink.time_offset_us",
         "0: stamps are the camera's, and TIMESYNC tells the autopilot how its clock stands to them",
@@ -226,6 +232,7 @@ pub const REASONS: &[(&str, &str)] = &[
     ("px4.topics", "sensor_optical_flow: PX4 as it is built reads it, and keeps our stamps"),
     ("px4.device_id", "any number that stays the same: what counts is that it is not 0"),
     ("px4.hz", "0: every step; PX4 joins what is too fast for it"),
+    ("px4.obstacles_m_max", "15: 7 m/s can be braked in 10 m, and from 2 m/s on the horizon of 8 s reaches that far"),
     ("px4.time_offset_us", "0: the agent's machine is this one, and the agent tells PX4 its clock"),
 ];
 

@@ -361,7 +361,7 @@ mod tests {
         assert!(unseen.ranges.len() == SECTORS && unseen.ranges.iter().all(|range| range.is_nan()), "{unseen:?}");
         let mut sectors = [Sector::Unknown; SECTORS];
         sectors[35] = Sector::Free { confidence: 0.95 };
-        sectors[36] = Sector::Occupied { ttc_s: 2.0, distance_m: 6.0, confidence: 0.99 };
+        sectors[36] = Sector::Occupied { ttc_s: 2.0, distance_m: 6.0, confidence: 0.99, whole: true };
         let found = Obstacles {
             older: moved.older,
             newer: moved.newer,

@@ -349,7 +349,7 @@ impl From<&Moved> for ObstaclesSample {
                 (sample.sector[k], sample.confidence[k]) = match sector {
                     Sector::Unknown => (0, 0.0),
                     Sector::Free { confidence } => (1, *confidence as f32),
-                    Sector::Occupied { ttc_s, distance_m, confidence } => {
+                    Sector::Occupied { ttc_s, distance_m, confidence, .. } => {
                         (sample.ttc_s[k], sample.distance_m[k]) = (*ttc_s as f32, *distance_m as f32);
                         (2, *confidence as f32)
                     }

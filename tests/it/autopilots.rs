@@ -1,6 +1,7 @@
 //! What autopilots are told: signs and axes by PX4's own rules, read back by the peers that they speak with.
 
 pub mod moves;
+mod surroundings;
 
 use std::{
     ffi::OsStr,
@@ -301,7 +302,8 @@ fn a_line_that_was_lost_is_opened_again() {
 #[test]
 fn cyclonedds_reads_what_px4_takes() {
     let (domain, namespace) = ros2::place();
-    let mut peer = peers::spawn("px4_read.py", [domain.to_string(), namespace.clone()]);
+    let names = ["sensor_optical_flow", "vehicle_optical_flow"].map(str::to_owned);
+    let mut peer = peers::spawn("px4_read.py", [domain.to_string(), namespace.clone()].into_iter().chain(names));
     peer.line_starting("listening", LONG);
     let topics = vec![Topic::SensorOpticalFlow, Topic::VehicleOpticalFlow];
     let settings = Px4 { domain, namespace, topics, time_offset_us: 5_000_000, ..Px4::default() };
@@ -366,12 +368,15 @@ fn settings_that_no_autopilot_understands_are_refused() {
     assert!(said.contains("leave odometry out of words"), "{said}");
     assert!(refused(Mavlink { words: vec![], ..default() }).contains("words is empty"));
     assert!(refused(Mavlink { hz: -1.0, ..default() }).contains("hz is -1"));
+    assert!(refused(Mavlink { obstacles_hz: 1.0, ..default() }).contains("forget obstacles within half a second"));
+    assert!(refused(Mavlink { obstacles_m_max: 655.35, ..default() }).contains("obstacles_m_max is 655.35"));
     let serial = Serial { path: "/dev/there_is_none".into(), baud: 57_600 };
     assert!(refused(Mavlink { link: Link::Serial(serial), ..default() }).contains("/dev/there_is_none"));
     let refused = |settings: Px4| px4::open(&settings).err().expect("it was opened").to_string();
     assert!(refused(Px4 { topics: vec![], ..Px4::default() }).contains("topics is empty"));
     assert!(refused(Px4 { device_id: 0, ..Px4::default() }).contains("device_id is 0"));
     assert!(refused(Px4 { hz: f64::NAN, ..Px4::default() }).contains("hz is NaN"));
+    assert!(refused(Px4 { obstacles_m_max: 0.5, ..Px4::default() }).contains("obstacles_m_max is 0.5"));
 }
 
 #[test]
@@ -380,19 +385,29 @@ fn the_program_tells_an_autopilot_of_every_step() {
     let [bag, launch] = ["in.mcap", "launch.toml"].map(|name| folder.path().join(name));
     bags::write(&bag, 0..6);
     let (mut peer, place) = autopilot("udp");
-    let link = format!("[publish.mavlink]\nautopilot = \"px4\"\n[publish.mavlink.link]\nudp = {place:?}\n");
+    let words = "[publish.mavlink]\nautopilot = \"px4\"\nwords = [\"flow\", \"obstacles\"]\nobstacles_hz = 0.0\n";
+    let link = format!("{words}[publish.mavlink.link]\nudp = {place:?}\n");
     let prefix = format!("nightflow_autopilots_{}", std::process::id());
-    fs::write(&launch, format!("{}[publish.iceoryx2]\nprefix = {prefix:?}\n{link}", bags::SETTINGS)).unwrap();
+    let settings = format!("{}[publish.iceoryx2]\nprefix = {prefix:?}\n{link}", bags::SETTINGS);
     let args = [OsStr::new("replay"), bag.as_os_str(), OsStr::new("--config"), launch.as_os_str()];
-    let replay = Command::new(env!("CARGO_BIN_EXE_nightflow")).args(args).output().unwrap();
-    let said = format!("{}{}", String::from_utf8_lossy(&replay.stdout), String::from_utf8_lossy(&replay.stderr));
-    assert!(replay.status.success(), "{said}");
+    let replay = |settings: &str| {
+        fs::write(&launch, settings).unwrap();
+        let replay = Command::new(env!("CARGO_BIN_EXE_nightflow")).args(args).output().unwrap();
+        let said = format!("{}{}", String::from_utf8_lossy(&replay.stdout), String::from_utf8_lossy(&replay.stderr));
+        (replay.status.code(), said)
+    };
+    let (code, said) = replay(&settings);
+    assert!(code == Some(2) && said.contains("add a table [motion.obstacles]"), "{code:?}: {said}");
+    let (code, said) = replay(&format!("{settings}[motion.obstacles]\n"));
+    assert_eq!(code, Some(0), "{said}");
     for _ in 0..5 {
         // The bag holds frames alone: without a calibration there is no angle, and that is told as no flow.
         let flow = next(&mut peer, "OPTICAL_FLOW_RAD");
         assert_eq!((number(&flow, "quality"), number(&flow, "distance")), (0.0, -1.0));
         assert!(flow["integrated_x"].is_null() && flow["integrated_xgyro"].is_null(), "{flow}");
         close(number(&flow, "integration_time_us"), 33_333.5, 0.6, "interval");
+        let around = next(&mut peer, "OBSTACLE_DISTANCE");
+        assert!(around["distances"].as_array().unwrap().iter().all(|cm| *cm == 65_535), "{around}");
     }
     peer.finish(LONG);
 }

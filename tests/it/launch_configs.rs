@@ -48,6 +48,14 @@ fn each_file_opens_what_it_is_for() {
     let forward = config("forward_avoidance.toml");
     assert!(forward.motion.camera == Mount::Forward && forward.motion.obstacles.is_some());
     assert!(forward.publish.ros2.is_some() && forward.publish.iceoryx2.is_some());
+    assert_eq!(forward.publish.px4.unwrap().topics, [Topic::ObstacleDistance], "what looks ahead has no flow below");
+    // What stands in its comments for ArduPilot is a configuration too, in the place of PX4's.
+    let text = text("forward_avoidance.toml");
+    let (ours, _) = text.split_once("[publish.px4]\n").unwrap();
+    let comments: Vec<&str> = text.lines().filter_map(|line| line.strip_prefix("#   ")).collect();
+    let ardupilot = Config::parse(&format!("{ours}{}", comments.join("\n")), Path::new("for ArduPilot")).unwrap();
+    let mavlink = ardupilot.publish.mavlink.unwrap();
+    assert_eq!((mavlink.autopilot, mavlink.words), (Autopilot::Ardupilot, vec![Word::Obstacles]));
     let replay = config("replay.toml");
     let SourceConfig::Mcap(bag) = replay.camera.source else { panic!("a recording is replayed") };
     assert!(Path::new(env!("CARGO_MANIFEST_DIR")).join(bag.path).is_file());

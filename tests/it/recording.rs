@@ -108,7 +108,7 @@ pub fn moved(step: u64, state: State) -> Moved {
 fn obstacles(older: Stamp, newer: Stamp) -> Obstacles {
     let mut sectors = [Sector::Unknown; SECTORS];
     sectors[35] = Sector::Free { confidence: 0.75 };
-    sectors[38] = Sector::Occupied { ttc_s: 2.0, distance_m: 6.0, confidence: 0.875 };
+    sectors[38] = Sector::Occupied { ttc_s: 2.0, distance_m: 6.0, confidence: 0.875, whole: true };
     let heading = [1.0, 0.0, 0.0];
     let (speed, horizon_s, delay_s) = (Some(3.0), 8.0, 0.15);
     Obstacles { older, newer, sectors, heading, heading_sd_rad: 0.01, speed, horizon_s, delay_s }

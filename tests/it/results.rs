@@ -103,7 +103,8 @@ fn moved(step: u64) -> Moved {
 fn obstacles(older: Stamp, newer: Stamp, metric: bool) -> Obstacles {
     let mut sectors = [Sector::Unknown; SECTORS];
     sectors[35] = Sector::Free { confidence: 0.75 };
-    sectors[36] = Sector::Occupied { ttc_s: 2.0, distance_m: if metric { 6.0 } else { f64::NAN }, confidence: 0.875 };
+    let distance_m = if metric { 6.0 } else { f64::NAN };
+    sectors[36] = Sector::Occupied { ttc_s: 2.0, distance_m, confidence: 0.875, whole: true };
     Obstacles {
         older,
         newer,

@@ -1,7 +1,7 @@
 """An autopilot's end of a MAVLink line, by pymavlink: mavlink_read.py udp|serial
 
-Prints where it listens ("at PLACE"), then each message as one line of JSON with its name, sender and time of arrival;
-what is not a number is null. "timesync" on standard input asks the sender for its clock.
+Prints where it listens ("at PLACE"), then each message as one line of JSON with its name, sender, length and time of
+arrival; what is not a number is null. "timesync" on standard input asks the sender for its clock.
 """
 
 import json
@@ -76,6 +76,7 @@ while True:
                 "from": [header.srcSystem, header.srcComponent],
                 "version": 2 if message.get_msgbuf()[0] == 0xFD else 1,
                 "arrived": arrived,
+                "bytes": len(message.get_msgbuf()),
             }
             print(json.dumps(told, allow_nan=False), flush=True)
     if sys.stdin in ready:

@@ -1,4 +1,4 @@
-"""PX4's end of DDS: reads /fmu/in/... with CycloneDDS: px4_read.py DOMAIN NAMESPACE
+"""PX4's end of DDS: reads /fmu/in/... with CycloneDDS: px4_read.py DOMAIN NAMESPACE TOPIC...
 
 Prints "listening", then "matched" when a writer of each topic was found, then each message as one line of JSON; what is
 not a number is null. Ends with its standard input.
@@ -51,20 +51,39 @@ class VehicleOpticalFlow(IdlStruct, typename=named("px4_msgs", "VehicleOpticalFl
     max_ground_distance: t.float32
 
 
+@dataclass
+class ObstacleDistance(IdlStruct, typename=named("px4_msgs", "ObstacleDistance")):
+    timestamp: t.uint64
+    frame: t.uint8
+    sensor_type: t.uint8
+    distances: t.array[t.uint16, 72]
+    increment: t.float32
+    min_distance: t.uint16
+    max_distance: t.uint16
+    angle_offset: t.float32
+
+
+KINDS = {
+    "sensor_optical_flow": SensorOpticalFlow,
+    "vehicle_optical_flow": VehicleOpticalFlow,
+    "obstacle_distance": ObstacleDistance,
+}
+
+
 def plain(value):
     if isinstance(value, (list, tuple)):
         return [plain(one) for one in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-domain, namespace = sys.argv[1:3]
+domain, namespace, *topics = sys.argv[1:]
 at = participant(domain)
 subscriber = Subscriber(at)
 readers = {}
-for topic, kind in {"sensor_optical_flow": SensorOpticalFlow, "vehicle_optical_flow": VehicleOpticalFlow}.items():
+for topic in topics:
     # As the agent reads: best effort.
     qos = sensor_qos(50)
-    readers[topic] = DataReader(subscriber, Topic(at, dds_name(f"{namespace}/fmu/in/{topic}"), kind, qos=qos), qos=qos)
+    readers[topic] = DataReader(subscriber, Topic(at, dds_name(f"{namespace}/fmu/in/{topic}"), KINDS[topic], qos=qos), qos=qos)
 print("listening", flush=True)
 matched = False
 while not select.select([sys.stdin], [], [], 0.005)[0]:

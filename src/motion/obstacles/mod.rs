@@ -52,6 +52,8 @@ pub enum Sector {
         distance_m: f64,
         /// Probability that it is met before the horizon, 0…1.
         confidence: f64,
+        /// Enough of the sector was seen to say that nothing nearer hides in the rest of it.
+        whole: bool,
     },
 }
 

@@ -262,7 +262,7 @@ impl Sectors {
             let ttc_s = 1.0 / track.closing;
             if track.closing > 0.0 && occupied >= config.confidence_min {
                 let distance_m = corridor.speed.map_or(f64::NAN, |speed| speed * ttc_s * track.stretch);
-                return Sector::Occupied { ttc_s, distance_m, confidence: occupied };
+                return Sector::Occupied { ttc_s, distance_m, confidence: occupied, whole: track.whole };
             }
             match 1.0 - occupied {
                 free if free >= config.confidence_min && sure && track.whole => Sector::Free { confidence: free },

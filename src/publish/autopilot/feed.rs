@@ -11,7 +11,10 @@ use std::{
     time::Duration,
 };
 
-use super::super::{Error, Offer, Sink};
+use super::{
+    super::{Error, Offer, Sink},
+    ring::Ring,
+};
 use crate::{
     flow::State,
     motion::{Integrated, Scale, Velocity},
@@ -28,10 +31,16 @@ pub(super) struct Moment {
     pub(super) integrated: Integrated,
     /// Metric and trusted, or none.
     pub(super) velocity: Option<Velocity>,
+    /// None where nobody looks for obstacles, or this autopilot is not told of them.
+    pub(super) ring: Option<Ring>,
 }
 
 /// What speaks to an autopilot; it lives on the feed's thread.
 pub(super) trait Voice: Send + 'static {
+    /// Centimetres up to which it tells of obstacles; none where it tells of none.
+    fn reach_cm(&self) -> Option<u16> {
+        None
+    }
     /// Says what is due after this step.
     fn say(&mut self, moment: &Moment) -> Result<(), String>;
     /// Called after every step, and while none comes.
@@ -43,6 +52,7 @@ pub(super) trait Voice: Send + 'static {
 /// Hands steps to the thread that speaks, and never waits for it.
 pub struct Feed {
     name: &'static str,
+    reach_cm: Option<u16>,
     moments: Option<SyncSender<Moment>>,
     lost: u64,
     unsaid: Arc<AtomicU64>,
@@ -52,13 +62,14 @@ pub struct Feed {
 impl Feed {
     pub(super) fn open(name: &'static str, voice: impl Voice) -> Result<Self, Error> {
         let (moments, heard) = sync_channel(MOMENTS_MAX);
+        let reach_cm = voice.reach_cm();
         let unsaid = Arc::new(AtomicU64::new(0));
         let round = Round { voice, name, unsaid: unsaid.clone(), told: false };
         let thread = std::thread::Builder::new()
             .name(format!("publish-{name}"))
             .spawn(move || round.run(&heard))
             .map_err(|e| Error::Open { sink: name, reason: e.to_string() })?;
-        Ok(Self { name, moments: Some(moments), lost: 0, unsaid, thread: Some(thread) })
+        Ok(Self { name, reach_cm, moments: Some(moments), lost: 0, unsaid, thread: Some(thread) })
     }
 }
 
@@ -73,7 +84,8 @@ impl Sink for Feed {
             matches!(velocity.scale, Scale::Metric { .. }) && !matches!(moved.state, State::Blind(_))
         };
         let velocity = moved.velocity.as_ref().ok().filter(trusted).copied();
-        let moment = Moment { integrated: moved.integrated, velocity };
+        let ring = self.reach_cm.and_then(|max_cm| Ring::of(moved, max_cm));
+        let moment = Moment { integrated: moved.integrated, velocity, ring };
         let reason = match &self.moments {
             Some(moments) if moments.try_send(moment).is_ok() => return Ok(()),
             Some(_) => format!("the line is behind by {MOMENTS_MAX} steps"),

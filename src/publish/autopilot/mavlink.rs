@@ -3,21 +3,30 @@
 use std::time::{Duration, Instant};
 
 use ::mavlink::dialects::common::{
-    MavEstimatorType, MavFrame, MavMessage, ODOMETRY_DATA, OPTICAL_FLOW_DATA, OPTICAL_FLOW_RAD_DATA,
+    MavDistanceSensor, MavEstimatorType, MavFrame, MavMessage, OBSTACLE_DISTANCE_DATA, ODOMETRY_DATA,
+    OPTICAL_FLOW_DATA, OPTICAL_FLOW_RAD_DATA,
 };
 
 use super::{
     Autopilot, Mavlink, Word,
     feed::{Feed, Moment, Voice},
     link::Wire,
-    stream::{Span, Stream},
+    reach_cm,
+    ring::{INCREMENT_DEG, MIN_CM, Ring},
+    stream::{Span, Stream, stamp_us},
 };
-use crate::{clock, motion::Velocity, publish::Error};
+use crate::{
+    clock,
+    motion::Velocity,
+    publish::{Error, pace::Pace},
+};
 
 const NAME: &str = "mavlink";
 /// ArduPilot takes the first flow after half a second of silence for a rate of zero, whatever it says, and believes its
 /// quality. So the first one is said with quality 0.
 const SILENCE: Duration = Duration::from_millis(400);
+/// PX4 and ArduPilot forget obstacles after half a second.
+const OBSTACLES_HZ_MIN: f64 = 4.0;
 /// (rad/s)²: above it a body rate was not observed.
 const UNOBSERVED: f64 = 1e4;
 
@@ -25,7 +34,7 @@ const UNOBSERVED: f64 = 1e4;
 pub fn open(settings: &Mavlink) -> Result<Feed, Error> {
     let refused = |reason: String| Error::Open { sink: NAME, reason };
     if settings.words.is_empty() {
-        return Err(refused("words is empty: name flow or odometry".into()));
+        return Err(refused("words is empty: name flow, odometry or obstacles".into()));
     }
     if settings.autopilot == Autopilot::Ardupilot && settings.words.contains(&Word::Odometry) {
         return Err(refused(
@@ -37,19 +46,34 @@ pub fn open(settings: &Mavlink) -> Result<Feed, Error> {
     if !(0.0..=1000.0).contains(&settings.hz) {
         return Err(refused(format!("hz is {}, expected 0 for every step, or up to 1000", settings.hz)));
     }
+    if settings.obstacles_hz != 0.0 && !(OBSTACLES_HZ_MIN..=1000.0).contains(&settings.obstacles_hz) {
+        return Err(refused(format!(
+            "obstacles_hz is {}, expected 0 for every step, or {OBSTACLES_HZ_MIN} to 1000: autopilots forget obstacles \
+             within half a second",
+            settings.obstacles_hz
+        )));
+    }
+    let reach_cm = reach_cm(settings.obstacles_m_max).map_err(refused)?;
     let wire = Wire::open(settings).map_err(refused)?;
-    Feed::open(NAME, Speaker { settings: settings.clone(), stream: Stream::new(settings.hz), wire, said: None })
+    let (stream, pace) = (Stream::new(settings.hz), Pace::new(settings.obstacles_hz));
+    Feed::open(NAME, Speaker { settings: settings.clone(), reach_cm, stream, pace, wire, said: None })
 }
 
 struct Speaker {
     settings: Mavlink,
+    reach_cm: u16,
     stream: Stream,
+    pace: Pace,
     wire: Wire,
     /// When flow was last said.
     said: Option<Instant>,
 }
 
 impl Voice for Speaker {
+    fn reach_cm(&self) -> Option<u16> {
+        self.settings.words.contains(&Word::Obstacles).then_some(self.reach_cm)
+    }
+
     fn say(&mut self, moment: &Moment) -> Result<(), String> {
         let spans = self.stream.take(&moment.integrated);
         let due = spans[1].is_some();
@@ -59,13 +83,16 @@ impl Voice for Speaker {
             self.said = Some(clock::instant());
         }
         if due && self.settings.words.contains(&Word::Odometry) {
-            let stamp_us = Span::from(&moment.integrated).stamp_us(self.settings.time_offset_us);
+            let stamp_us = stamp_us(moment.integrated.newer, self.settings.time_offset_us);
             // Without a velocity there is nothing to say: PX4 notices the silence, and no value would mean "none".
             if let Some(velocity) = &moment.velocity {
                 self.wire.send(&odometry(velocity, stamp_us))?;
             }
         }
-        Ok(())
+        match &moment.ring {
+            Some(ring) if self.pace.lets(ring.newer) => self.wire.send(&obstacles(&self.settings, ring)),
+            _ => Ok(()),
+        }
     }
 
     fn tend(&mut self) -> Result<(), String> {
@@ -132,6 +159,26 @@ fn ardupilot_flow(settings: &Mavlink, span: &Span, first: bool) -> MavMessage {
         quality: if first { 0 } else { span.quality },
         flow_rate_x: rates[0] as f32,
         flow_rate_y: rates[1] as f32,
+    })
+}
+
+/// ArduPilot takes what is free for what is unknown, and passes over both.
+fn obstacles(settings: &Mavlink, ring: &Ring) -> MavMessage {
+    let ring = match settings.autopilot {
+        Autopilot::Px4 => ring.paired(),
+        Autopilot::Ardupilot => *ring,
+    };
+    MavMessage::OBSTACLE_DISTANCE(OBSTACLE_DISTANCE_DATA {
+        time_usec: stamp_us(ring.newer, settings.time_offset_us),
+        distances: ring.cm,
+        min_distance: MIN_CM,
+        max_distance: ring.max_cm,
+        // A camera is none of those that have a number.
+        sensor_type: MavDistanceSensor::MAV_DISTANCE_SENSOR_UNKNOWN,
+        increment: INCREMENT_DEG,
+        increment_f: f32::from(INCREMENT_DEG),
+        angle_offset: 0.0,
+        frame: MavFrame::MAV_FRAME_BODY_FRD,
     })
 }
 

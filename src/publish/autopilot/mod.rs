@@ -1,12 +1,14 @@
-//! To an autopilot: the flow straight below and the velocity, over MAVLink or as PX4's own topics over DDS.
+//! To an autopilot: the flow straight below, the velocity and obstacles, over MAVLink or as PX4's own topics over DDS.
 //!
 //! Both say the same of a step that has no trustworthy flow: quality 0, and no number that could be taken for a
-//! measured one. The message still goes out, for its interval has passed, and an autopilot counts on the cadence.
+//! measured one. The message still goes out, for its interval has passed, and an autopilot counts on the cadence. So it
+//! is with obstacles: what can't be seen is unknown, and the message goes out though all of it is.
 
 mod feed;
 mod link;
 pub mod mavlink;
 pub mod px4;
+mod ring;
 mod stream;
 
 use std::path::PathBuf;
@@ -32,6 +34,10 @@ pub struct Mavlink {
     pub sensor: u8,
     /// Steps are joined so that flow goes out at most this often; 0 says every step.
     pub hz: f64,
+    /// Obstacles are told at most this often; 0 says every step.
+    pub obstacles_hz: f64,
+    /// Metres up to which obstacles are told, and up to which a sector must be free to be told so.
+    pub obstacles_m_max: f64,
     /// Added to every stamp that goes out, the answers to TIMESYNC among them.
     pub time_offset_us: i64,
     /// How the autopilot is reached.
@@ -76,6 +82,16 @@ pub enum Word {
     Flow,
     /// The body's velocity, where it is metric: ODOMETRY. PX4 only.
     Odometry,
+    /// What is in the way, where `[motion.obstacles]` looks for it: OBSTACLE_DISTANCE.
+    Obstacles,
+}
+
+/// Centimetres of `obstacles_m_max`; one more than the greatest must not come near the number for "unknown".
+fn reach_cm(obstacles_m_max: f64) -> Result<u16, String> {
+    if !(1.0..=650.0).contains(&obstacles_m_max) {
+        return Err(format!("obstacles_m_max is {obstacles_m_max}, expected 1 to 650 m"));
+    }
+    Ok((100.0 * obstacles_m_max) as u16)
 }
 
 impl Default for Mavlink {
@@ -87,6 +103,8 @@ impl Default for Mavlink {
             component: 197,
             sensor: 0,
             hz: 0.0,
+            obstacles_hz: 10.0,
+            obstacles_m_max: 15.0,
             time_offset_us: 0,
             link: Link::Udp("127.0.0.1:14580".into()),
         }

@@ -7,7 +7,9 @@ use serde::{Deserialize, Serialize};
 
 use super::{
     feed::{Feed, Moment, Voice},
-    stream::{Span, Stream},
+    reach_cm,
+    ring::{INCREMENT_DEG, MIN_CM, Ring},
+    stream::{Span, Stream, stamp_us},
 };
 use crate::{
     camera::ros2 as dds,
@@ -16,10 +18,14 @@ use crate::{
         Error,
         ros2::{ACK_BUFFER, publish, publisher},
     },
-    wire::{SensorOpticalFlow, VehicleOpticalFlow},
+    wire::{ObstacleDistance, SensorOpticalFlow, VehicleOpticalFlow},
 };
 
 const NAME: &str = "px4";
+/// MAV_FRAME_BODY_FRD.
+const BODY_FRD: u8 = 12;
+/// MAV_DISTANCE_SENSOR_UNKNOWN: a camera is none of those that have a number.
+const SENSOR_UNKNOWN: u8 = 4;
 
 /// `[publish.px4]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -35,6 +41,8 @@ pub struct Px4 {
     pub device_id: u32,
     /// Steps are joined so that flow goes out at most this often; 0 says every step.
     pub hz: f64,
+    /// Metres up to which obstacles are told, and up to which a sector must be free to be told so.
+    pub obstacles_m_max: f64,
     /// Added to every stamp that goes out.
     pub time_offset_us: i64,
 }
@@ -47,6 +55,8 @@ pub enum Topic {
     SensorOpticalFlow,
     /// `/fmu/in/vehicle_optical_flow`: the same past that stage; PX4 reads it only if its dds_topics.yaml names it.
     VehicleOpticalFlow,
+    /// `/fmu/in/obstacle_distance`: what is in the way, step by step, where `[motion.obstacles]` looks for it.
+    ObstacleDistance,
 }
 
 impl Default for Px4 {
@@ -57,6 +67,7 @@ impl Default for Px4 {
             topics: vec![Topic::SensorOpticalFlow],
             device_id: 0x4E46,
             hz: 0.0,
+            obstacles_m_max: 15.0,
             time_offset_us: 0,
         }
     }
@@ -66,7 +77,7 @@ impl Default for Px4 {
 pub fn open(settings: &Px4) -> Result<Feed, Error> {
     let refused = |reason: String| Error::Open { sink: NAME, reason };
     if settings.topics.is_empty() {
-        return Err(refused("topics is empty: name sensor_optical_flow".into()));
+        return Err(refused("topics is empty: name sensor_optical_flow or obstacle_distance".into()));
     }
     if settings.device_id == 0 {
         return Err(refused("device_id is 0, which PX4 takes for no sensor".into()));
@@ -74,7 +85,8 @@ pub fn open(settings: &Px4) -> Result<Feed, Error> {
     if !(0.0..=1000.0).contains(&settings.hz) {
         return Err(refused(format!("hz is {}, expected 0 for every step, or up to 1000", settings.hz)));
     }
-    Feed::open(NAME, Speaker::join(settings).map_err(refused)?)
+    let reach_cm = reach_cm(settings.obstacles_m_max).map_err(refused)?;
+    Feed::open(NAME, Speaker::join(settings, reach_cm).map_err(refused)?)
 }
 
 struct Speaker {
@@ -82,6 +94,8 @@ struct Speaker {
     stream: Stream,
     sensor: Option<Publisher<SensorOpticalFlow>>,
     vehicle: Option<Publisher<VehicleOpticalFlow>>,
+    obstacles: Option<Publisher<ObstacleDistance>>,
+    reach_cm: u16,
     /// Spans without flow so far.
     blind: u32,
     node: Option<Node>,
@@ -89,18 +103,21 @@ struct Speaker {
 }
 
 impl Speaker {
-    fn join(settings: &Px4) -> Result<Self, String> {
+    fn join(settings: &Px4, reach_cm: u16) -> Result<Self, String> {
         let mut node = dds::join(settings.domain, "nightflow_px4", ACK_BUFFER)?;
         let spinner = node.spinner();
         let name = |topic: &str| format!("{}/fmu/in/{topic}", settings.namespace.trim_end_matches('/'));
         let wanted = |topic: Topic| settings.topics.contains(&topic);
         let sensor = wanted(Topic::SensorOpticalFlow).then(|| publisher(&mut node, &name("sensor_optical_flow")));
         let vehicle = wanted(Topic::VehicleOpticalFlow).then(|| publisher(&mut node, &name("vehicle_optical_flow")));
+        let obstacles = wanted(Topic::ObstacleDistance).then(|| publisher(&mut node, &name("obstacle_distance")));
         Ok(Self {
             settings: settings.clone(),
             stream: Stream::new(settings.hz),
             sensor: sensor.transpose()?,
             vehicle: vehicle.transpose()?,
+            obstacles: obstacles.transpose()?,
+            reach_cm,
             blind: 0,
             node: Some(node),
             spinning: std::thread::Builder::new()
@@ -124,9 +141,17 @@ impl Speaker {
 }
 
 impl Voice for Speaker {
+    fn reach_cm(&self) -> Option<u16> {
+        self.obstacles.as_ref().map(|_| self.reach_cm)
+    }
+
     fn say(&mut self, moment: &Moment) -> Result<(), String> {
         let spans = self.stream.take(&moment.integrated);
-        spans.into_iter().flatten().try_for_each(|span| self.span(&span))
+        spans.into_iter().flatten().try_for_each(|span| self.span(&span))?;
+        match (&self.obstacles, &moment.ring) {
+            (Some(obstacles), Some(ring)) => publish(obstacles, &around(&self.settings, ring)),
+            _ => Ok(()),
+        }
     }
 }
 
@@ -162,6 +187,21 @@ fn sensed(settings: &Px4, span: &Span, blind: u32) -> SensorOpticalFlow {
         min_ground_distance: f32::NAN,
         max_ground_distance: f32::NAN,
         mode: 0,
+    }
+}
+
+/// PX4 takes the stamp for the time of what was seen, and what is older than half a second for nothing.
+fn around(settings: &Px4, ring: &Ring) -> ObstacleDistance {
+    let cm = ring.paired().cm;
+    ObstacleDistance {
+        timestamp: stamp_us(ring.newer, settings.time_offset_us),
+        frame: BODY_FRD,
+        sensor_type: SENSOR_UNKNOWN,
+        distances: std::array::from_fn(|row| std::array::from_fn(|i| cm[12 * row + i])),
+        increment: f32::from(INCREMENT_DEG),
+        min_distance: MIN_CM,
+        max_distance: ring.max_cm,
+        angle_offset: 0.0,
     }
 }
 

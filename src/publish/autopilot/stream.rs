@@ -2,6 +2,11 @@
 
 use crate::{clock::Stamp, motion::Integrated};
 
+/// A stamp as autopilots count: microseconds, in the clock that the offset leads to.
+pub(super) fn stamp_us(stamp: Stamp, offset_us: i64) -> u64 {
+    u64::try_from(stamp.ns().div_euclid(1000).saturating_add(offset_us)).unwrap_or(0)
+}
+
 /// The flow over one or more steps that follow each other.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Span {
@@ -44,9 +49,9 @@ impl Span {
         micros.clamp(0, u32::MAX.into()) as u32
     }
 
-    /// A stamp as autopilots count: microseconds, in the clock that the offset leads to.
+    /// The newer frame's, see [`stamp_us`].
     pub(super) fn stamp_us(&self, offset_us: i64) -> u64 {
-        u64::try_from(self.newer.ns().div_euclid(1000).saturating_add(offset_us)).unwrap_or(0)
+        stamp_us(self.newer, offset_us)
     }
 
     /// Both, or `None` where they do not join: a hole between them, or one knows what the other does not.
