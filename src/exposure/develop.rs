@@ -18,8 +18,6 @@ use crate::{camera::Frame, wire::Image};
 #[derive(Debug, Default)]
 struct Kept {
     exposed: Exposed,
-    /// The image before the gain.
-    reduced: Vec<f32>,
     fingerprint: u64,
 }
 
@@ -111,7 +109,7 @@ impl Developer {
         };
         let [width, height] = plan.size;
         self.counts.resize(layout.width, 0);
-        self.spare.reduced.resize(3 * width * height, 0.0);
+        self.spare.exposed.linear.resize(3 * width * height, 0.0);
         self.spare.exposed.rgb.resize(3 * width * height, 0.0);
         self.spare.exposed.saturated.resize(width * height, 0);
         reducer.start(layout);
@@ -146,7 +144,8 @@ impl Developer {
 
     /// The one pass over the camera's bytes.
     fn pass(&mut self, layout: &Layout, image: &Image, reducer: &mut Reducer) -> Seen {
-        let mut target = Target { reduced: &mut self.spare.reduced, saturated: &mut self.spare.exposed.saturated };
+        let exposed = &mut self.spare.exposed;
+        let mut target = Target { reduced: &mut exposed.linear, saturated: &mut exposed.saturated };
         let mut seen = Seen::default();
         let mut fingerprint = Fingerprint::default();
         let (stride, shift, rows) = (layout.stride(), layout.shift(), reducer.plan.rows());
@@ -204,7 +203,7 @@ impl Developer {
 
 impl Kept {
     fn brighten(&mut self, gain: f32, generation: &mut u64) {
-        sums::brighten(&self.reduced, gain, &mut self.exposed.rgb);
+        sums::brighten(&self.exposed.linear, gain, &mut self.exposed.rgb);
         *generation += 1;
         self.exposed.gain = gain;
         self.exposed.generation = *generation;

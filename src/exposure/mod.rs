@@ -45,6 +45,8 @@ pub struct Exposed {
     pub scale: [f32; 2],
     /// The image, see above.
     pub rgb: Vec<f32>,
+    /// The same before the gain and the clip, where the frame was developed from raw counts; else empty.
+    pub linear: Vec<f32>,
     /// 1 where a source pixel stood at the white level; `height` × `width`.
     pub saturated: Vec<u8>,
     /// Part of the developed pixels that are saturated.
