@@ -7,7 +7,7 @@ use nightflow::{
     camera::{Frame, Sample},
     clock::Stamp,
     darkness::{
-        flight::{BLACK, Flight, Settings, WHITE},
+        flight::{BLACK, Flight, Settings, TrueFlow, WHITE},
         ladder::MEANS,
         noise::{Noise, Normals},
     },
@@ -85,6 +85,8 @@ pub struct Flown {
     pub sensors: Sensors,
     /// Counts, row by row.
     pub frames: Vec<Vec<u16>>,
+    /// True flow from each frame to the next; none where the frames were kept in a file.
+    pub flows: Vec<TrueFlow>,
 }
 
 /// Flies and draws the clean frames.
@@ -100,7 +102,7 @@ pub fn fly(plan: Plan) -> Result<Flown, String> {
         noise: None,
     };
     let flight = Flight::new(settings).map_err(|error| error.to_string())?;
-    let (mut imus, mut ranges, mut truth, mut frames) = (vec![], vec![], vec![], vec![]);
+    let (mut imus, mut ranges, mut truth, mut frames, mut flows) = (vec![], vec![], vec![], vec![], vec![]);
     let info = flight.info(Stamp(0));
     for shot in flight {
         for sample in shot.samples {
@@ -115,8 +117,9 @@ pub fn fly(plan: Plan) -> Result<Flown, String> {
             }
         }
         truth.push(Moment { stamp: shot.truth.stamp, velocity: shot.truth.velocity, rates: shot.truth.rates });
+        flows.extend(shot.truth.flow);
     }
-    Ok(Flown { sensors: Sensors { plan, info, imus, ranges, truth }, frames })
+    Ok(Flown { sensors: Sensors { plan, info, imus, ranges, truth }, frames, flows })
 }
 
 impl Flown {

@@ -9,7 +9,11 @@ use std::{
 use nightflow::{
     clock::Stamp,
     config::Config,
-    darkness::{flight, ladder::MEANS, noise::Noise},
+    darkness::{
+        flight::{self, TrueFlow},
+        ladder::MEANS,
+        noise::Noise,
+    },
     exposure::Developer,
     flow::{Flow, Grid, Matcher, Own, State},
 };
@@ -42,6 +46,23 @@ impl Step {
     /// The step as the odometer takes it.
     pub fn flow(&self, older: Stamp, newer: Stamp) -> Flow<'_> {
         Flow { older, newer, grid: self.grid, vectors: &self.vectors, confidence: &self.confidence }
+    }
+}
+
+/// The method that knows the truth.
+pub const TRUTH: &str = "truth";
+
+impl Step {
+    /// The truth, sure wherever it is known.
+    fn of(flow: &TrueFlow) -> Step {
+        let known = |vector: &[f32; 2]| f32::from(u8::from(vector.iter().all(|along| along.is_finite())));
+        Step {
+            blind: false,
+            noise_level: f32::NAN,
+            grid: flow.grid,
+            confidence: flow.vectors.as_chunks::<2>().0.iter().map(known).collect(),
+            vectors: flow.vectors.clone(),
+        }
     }
 }
 
@@ -94,6 +115,15 @@ impl<'a> Taken<'a> {
         Ok(Self { sensors: flown.sensors.clone(), frames: Some(flown), cache })
     }
 
+    /// The true flow at every exposure; what velocity then lacks is not the flow's.
+    fn truly(&mut self) -> Result<Seen, String> {
+        if self.flown()?.flows.is_empty() {
+            self.frames = Some(fly(self.sensors.plan)?);
+        }
+        let steps: Vec<Step> = self.flown()?.flows.iter().map(Step::of).collect();
+        Ok(std::array::from_fn(|_| steps.clone()))
+    }
+
     fn flown(&mut self) -> Result<&Flown, String> {
         let Self { sensors, frames, cache } = self;
         if frames.is_none() {
@@ -103,7 +133,7 @@ impl<'a> Taken<'a> {
                     let counts: Vec<u16> =
                         bytes.as_chunks::<2>().0.iter().map(|two| u16::from_le_bytes(*two)).collect();
                     let frames = counts.chunks(sensors.plan.size[0] * sensors.plan.size[1]).map(<[u16]>::to_vec);
-                    Flown { sensors: sensors.clone(), frames: frames.collect() }
+                    Flown { sensors: sensors.clone(), frames: frames.collect(), flows: vec![] }
                 }
                 None => fly(sensors.plan)?,
             });
@@ -119,6 +149,14 @@ impl<'a> Taken<'a> {
             && kept.steps.iter().all(|steps| steps.len() == plan.steps)
         {
             return Ok(unpack(&kept, &bytes));
+        }
+        if name == TRUTH {
+            let seen = self.truly()?;
+            if let Some(path) = path {
+                let (kept, bytes) = pack(&seen);
+                write(&path, &kept, &bytes)?;
+            }
+            return Ok(seen);
         }
         let config = settings(name);
         let matcher = match matcher {
