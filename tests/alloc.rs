@@ -8,7 +8,8 @@ use std::{
 use nightflow::{
     camera::Frame,
     clock::Stamp,
-    exposure::{Config, Developer, Packing, Pattern},
+    exposure::{Config, Developer, Exposed, Packing, Pair, Pattern},
+    flow::{self, Fake, Matcher, Own, Resolution},
     wire::{Header, Image, Time},
 };
 
@@ -118,5 +119,34 @@ fn developing_takes_no_memory_after_the_first_frames() {
         });
         assert_eq!(taken, 0, "{encoding}");
         assert!(generations > 0, "pairs were made");
+    }
+}
+
+#[test]
+fn refining_takes_no_memory_after_the_first_pair() {
+    let frames: Vec<Exposed> = (1..=4u64)
+        .map(|number| Exposed {
+            stamp: Stamp(number as i64),
+            width: 96,
+            height: 64,
+            scale: [2.0; 2],
+            rgb: (0..3 * 96 * 64).map(|i| ((i * 7919 + 31 * number as usize) % 1009) as f32 / 1009.0).collect(),
+            saturated: vec![0; 96 * 64],
+            raw_mean: 0.05,
+            generation: number,
+            ..Exposed::default()
+        })
+        .collect();
+    for resolution in [Resolution::Quarter, Resolution::Full] {
+        let config = flow::Config { refine: true, resolution, ..flow::Config::default() };
+        let mut matcher = Matcher::with(&config, Box::new(Fake::shift(1.0, -0.5)));
+        let mut own = Own::default();
+        let mut step = |at: usize| {
+            let pair = Pair { older: &frames[at], newer: &frames[at + 1], gain_step: None };
+            matcher.between(&pair, &mut own).map(drop).unwrap();
+        };
+        step(0);
+        let expected = if resolution == Resolution::Quarter { 0 } else { 8 };
+        assert_eq!(taken(|| (1..3).for_each(&mut step)), expected, "{resolution:?}");
     }
 }

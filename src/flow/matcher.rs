@@ -9,6 +9,7 @@ use crate::{
         network::{Model, Network, Raster, Slot},
         onnx::Onnx,
         padding::{self, Padded},
+        refine::Refiner,
     },
 };
 
@@ -19,6 +20,7 @@ const CELL: usize = 4;
 pub struct Matcher {
     pub(crate) config: Config,
     network: Box<dyn Network>,
+    refiner: Refiner,
     /// Whose features each slot holds.
     described: [Option<Key>; 2],
     /// The network's raster, where it is not the one that was asked for.
@@ -70,6 +72,7 @@ impl Matcher {
         Self {
             config: config.clone(),
             network,
+            refiner: Refiner::default(),
             described: [None; 2],
             flow: vec![],
             uncertainty: vec![],
@@ -131,14 +134,22 @@ impl Matcher {
         if padded.is_whole() && self.config.resolution == Resolution::Quarter {
             let raster = Raster { flow: canvas.flow, uncertainty: canvas.confidence };
             self.network.between(slot, older.scale, raster)?;
-            finish(canvas.flow, canvas.confidence)?;
+            finite(canvas.flow, canvas.confidence)?;
+            if self.config.refine {
+                self.refiner.refine(pair, columns, canvas.flow, canvas.confidence);
+            }
+            confide(canvas.confidence);
         } else {
             self.counts.copied += 1;
             self.flow.resize(columns * rows * 2, 0.0);
             self.uncertainty.resize(columns * rows, 0.0);
             let raster = Raster { flow: &mut self.flow, uncertainty: &mut self.uncertainty };
             self.network.between(slot, older.scale, raster)?;
-            finish(&self.flow, &mut self.uncertainty)?;
+            finite(&self.flow, &self.uncertainty)?;
+            if self.config.refine {
+                self.refiner.refine(pair, columns, &mut self.flow, &mut self.uncertainty);
+            }
+            confide(&mut self.uncertainty);
             if self.config.resolution == Resolution::Quarter {
                 padding::crop(&self.flow, columns, canvas.flow, grid.width, 2);
                 padding::crop(&self.uncertainty, columns, canvas.confidence, grid.width, 1);
@@ -209,10 +220,8 @@ fn checked(older: &Exposed, newer: &Exposed) -> Result<(), Error> {
     Ok(())
 }
 
-/// Refuses what is no number, then turns expected errors into confidence where they stand.
-///
-/// An end-point error that is exponentially distributed with mean s is below one pixel with probability 1 − exp(−1/s).
-fn finish(flow: &[f32], uncertainty: &mut [f32]) -> Result<(), Error> {
+/// Refuses what is no number.
+fn finite(flow: &[f32], uncertainty: &[f32]) -> Result<(), Error> {
     let odd = |values: &[f32]| values.iter().filter(|value| !value.is_finite()).count();
     let (vectors, errors) = (odd(flow), odd(uncertainty));
     if vectors + errors > 0 {
@@ -223,11 +232,17 @@ fn finish(flow: &[f32], uncertainty: &mut [f32]) -> Result<(), Error> {
             of: uncertainty.len(),
         });
     }
+    Ok(())
+}
+
+/// Turns expected errors into confidence where they stand.
+///
+/// An end-point error that is exponentially distributed with mean s is below one pixel with probability 1 − exp(−1/s).
+fn confide(uncertainty: &mut [f32]) {
     for value in uncertainty {
         // The smallest that still has a finite reciprocal with room to spare; its confidence is 1.
         *value = 1.0 - (-1.0 / value.max(1e-6)).exp();
     }
-    Ok(())
 }
 
 /// Takes the confidence from cells that stand on saturated pixels in either frame, and from those whose match has left

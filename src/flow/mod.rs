@@ -11,6 +11,7 @@ mod onnx;
 mod onnx_graph;
 pub mod padding;
 mod provider;
+mod refine;
 pub mod runtime;
 mod trust;
 pub mod wheel;

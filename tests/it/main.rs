@@ -26,6 +26,7 @@ mod outliers;
 mod peers;
 mod recording;
 mod recordings;
+mod refine;
 mod results;
 mod road;
 mod ros2;

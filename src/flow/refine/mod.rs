@@ -1,0 +1,186 @@
+//! The last step behind the network: every vector is moved to where the images' own gradients want it, as far as noise allows.
+//!
+//! A network is right to a part of a pixel and errs alike over the whole image; gradients are right to hundredths, but only
+//! near the truth and only where there is texture above the noise. So the network's vector is the prior, and a window of
+//! Lucas and Kanade's around it is the likelihood:
+//!
+//! - Both frames become grey (all the light of a Bayer cell, unclipped where the raw counts are at hand), slightly blurred.
+//! - The newer frame is warped to the older one by the vectors (bicubic), and the mean of both gives the gradients. Such
+//!   gradients are not correlated with the difference of the frames, so that noise does not pull to whole or half pixels.
+//! - A pixel's weight is the inverse of its noise variance, which the exposure stage measured; what noise adds to the
+//!   gradients' products is taken off. Where frames differ by more than noise, the information is divided by as much.
+//! - The products are summed over windows of ever larger size. What the larger window says is what the smaller one
+//!   believes beforehand: flat cells and dark ones take the correction of what lies around them, at most that, and the
+//!   largest window believes the network. Errors of a network are alike over many cells, and many cells know what one
+//!   does not.
+//! - Two rounds, each at the place that the one before found. A cell whose frames are no more alike after the first round
+//!   than before keeps the network's vector.
+
+mod pyramid;
+mod sums;
+
+use crate::{
+    clock::Stamp,
+    exposure::{Exposed, Pair},
+};
+use pyramid::{Level, Sums};
+
+/// Pixels of the developed image in a cell, along either side.
+const CELL: usize = 4;
+/// Images with a shorter side are left alone.
+const SIDE_MIN: usize = 16;
+const ROUNDS: usize = 2;
+/// The variance that a pixel's value has beyond what is known of its noise: half a step of eight bits, squared.
+const FLOOR: f32 = 3.84e-6;
+/// An expected end-point error on either axis: a vector of two normal errors of deviation s has a mean length of 1.25 s.
+const AXIS: f32 = 0.8;
+/// No vector is known better beforehand than this, pixels.
+const PRIOR_MIN: f32 = 0.05;
+/// No vector is said to be better than this afterwards, pixels: what the models of noise and motion leave out.
+const ERROR_MIN: f32 = 0.1;
+
+/// Refines the vectors of one pair after the other. It takes memory at the first pair of a size only.
+#[derive(Debug, Default)]
+pub(super) struct Refiner {
+    /// The newest two frames' grey.
+    seen: [Grey; 2],
+    scratch: Vec<f32>,
+    /// The network's vectors in pixels and what is added to them: cells × 2.
+    start: Vec<f32>,
+    change: Vec<f32>,
+    /// Deviation of the network's vectors beforehand, on either axis, pixels.
+    prior: Vec<f32>,
+    /// Half of the trace of the covariance afterwards, pixels².
+    variance: Vec<f32>,
+    /// Mean squared difference of the frames in each window before the first round.
+    before: Vec<f32>,
+    warp: sums::Warp,
+    cells: Sums,
+    window: Sums,
+    levels: Vec<Level>,
+}
+
+/// A frame's grey, blurred.
+#[derive(Debug, Default)]
+struct Grey {
+    key: Option<(u64, Stamp)>,
+    values: Vec<f32>,
+    /// Variance of the noise before the blur: `slope` × value + `base`.
+    slope: f32,
+    base: f32,
+}
+
+impl Grey {
+    fn see(&mut self, exposed: &Exposed, scratch: &mut Vec<f32>) {
+        let pixels = exposed.width * exposed.height;
+        self.values.resize(pixels, 0.0);
+        scratch.resize(pixels, 0.0);
+        match exposed.linear.len() == 3 * pixels {
+            true => sums::grey(&exposed.linear, 0.25 * exposed.gain, &mut self.values),
+            false => sums::grey(&exposed.rgb, 0.25, &mut self.values),
+        }
+        sums::blur(&mut self.values, scratch, exposed.width);
+        // A cell's pixels all count alike in red + 2·green + blue.
+        let part = exposed.gain / (exposed.scale[0] * exposed.scale[1]);
+        (self.slope, self.base) = match exposed.noise {
+            Some(noise) => (noise.a as f32 * part, noise.b.max(0.0) as f32 * part * exposed.gain),
+            None => (0.0, 0.0),
+        };
+        self.key = Some((exposed.generation, exposed.stamp));
+    }
+}
+
+impl Refiner {
+    /// Moves the vectors of `flow` (in camera pixels, on a raster of `columns`) and lowers their expected errors.
+    pub(super) fn refine(&mut self, pair: &Pair<'_>, columns: usize, flow: &mut [f32], uncertainty: &mut [f32]) {
+        let size = [pair.older.width, pair.older.height];
+        if size[0].min(size[1]) < SIDE_MIN {
+            return;
+        }
+        self.look(pair);
+        let raster = [size[0] / CELL, size[1] / CELL];
+        self.begin(raster, columns, pair.older.scale, flow, uncertainty);
+        let [older, newer] = &self.seen;
+        for round in 0..ROUNDS {
+            self.warp.bring(pair, [&older.values, &newer.values], raster, &self.start, &self.change);
+            let noise = [older.slope + newer.slope, older.base + newer.base];
+            self.warp.sum(&older.values, size, noise, &mut self.cells);
+            pyramid::centre(&mut self.cells, &self.change, &self.prior);
+            pyramid::smooth(&self.cells, &mut self.window);
+            if round == 0 {
+                self.before.clear();
+                self.before.extend(self.window.misfits());
+            } else {
+                withdraw(&self.window, &mut self.before, &mut self.change);
+            }
+            pyramid::halve(&self.cells, &mut self.levels);
+            pyramid::descend(&mut self.levels, &self.window, &mut self.change, &mut self.variance);
+        }
+        self.conclude(raster, columns, pair.older.scale, flow, uncertainty);
+    }
+
+    /// The grey of both frames; the newer one of a pair is the older one of the next.
+    fn look(&mut self, pair: &Pair<'_>) {
+        let key = |exposed: &Exposed| Some((exposed.generation, exposed.stamp));
+        let fits = |grey: &Grey, exposed: &Exposed| {
+            grey.key == key(exposed) && grey.values.len() == exposed.width * exposed.height
+        };
+        if !fits(&self.seen[0], pair.older) && fits(&self.seen[1], pair.older) {
+            self.seen.swap(0, 1);
+        }
+        for (grey, exposed) in self.seen.iter_mut().zip([pair.older, pair.newer]) {
+            if !fits(grey, exposed) {
+                grey.see(exposed, &mut self.scratch);
+            }
+        }
+    }
+
+    fn begin(&mut self, [width, height]: [usize; 2], columns: usize, scale: [f32; 2], flow: &[f32], errors: &[f32]) {
+        self.start.clear();
+        self.prior.clear();
+        let rows = flow.chunks_exact(2 * columns).zip(errors.chunks_exact(columns)).take(height);
+        for (vectors, errors) in rows {
+            let pixels = vectors.as_chunks::<2>().0[..width].iter().flat_map(|[u, v]| [u / scale[0], v / scale[1]]);
+            self.start.extend(pixels);
+            self.prior.extend(errors[..width].iter().map(|error| (AXIS * error).max(PRIOR_MIN)));
+        }
+        self.change.clear();
+        self.change.resize(2 * width * height, 0.0);
+        self.variance.clear();
+        self.variance.resize(width * height, 0.0);
+    }
+
+    fn conclude(
+        &self,
+        [width, height]: [usize; 2],
+        columns: usize,
+        scale: [f32; 2],
+        flow: &mut [f32],
+        errors: &mut [f32],
+    ) {
+        let rows = flow.chunks_exact_mut(2 * columns).zip(errors.chunks_exact_mut(columns)).take(height);
+        for (row, (vectors, errors)) in rows.enumerate() {
+            let vectors = vectors.as_chunks_mut::<2>().0[..width].iter_mut();
+            for (column, (vector, error)) in vectors.zip(errors).enumerate() {
+                let cell = row * width + column;
+                if self.before[cell] < 0.0 || self.variance[cell] <= 0.0 {
+                    continue;
+                }
+                vector[0] += self.change[2 * cell] * scale[0];
+                vector[1] += self.change[2 * cell + 1] * scale[1];
+                *error = error.min((self.variance[cell].sqrt() / AXIS).max(ERROR_MIN));
+            }
+        }
+    }
+}
+
+/// Cells that the first round did not make more alike go back to where they were, and stay there.
+fn withdraw(window: &Sums, before: &mut [f32], change: &mut [f32]) {
+    for ((after, before), change) in window.misfits().zip(before).zip(change.as_chunks_mut::<2>().0) {
+        // Asked this way round, a NaN goes back too.
+        let better = after <= *before;
+        if !better {
+            (*change, *before) = ([0.0; 2], f32::NEG_INFINITY);
+        }
+    }
+}
