@@ -94,7 +94,7 @@ pub const REASONS: &[(&str, &str)] = &[
     ),
     (
         "refine",
-        "a network errs by 0.05 pixels and more everywhere alike, what gradients know to hundredths (models/velocity.md)",
+        "false until the velocity bench has judged it: gradients know to hundredths what a network knows to a twentieth",
     ),
     ("gap_ms_max", "150: four lost frames at 30 Hz; beyond, a drone's motion leaves the reach of the cost volumes"),
     ("golden_check", "a runtime that computes something else is found at start, for the price of one small pair"),
