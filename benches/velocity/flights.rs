@@ -7,7 +7,7 @@ use nightflow::{
     camera::{Frame, Sample},
     clock::Stamp,
     darkness::{
-        flight::{BLACK, Flight, Settings, TrueFlow, WHITE},
+        flight::{self, BLACK, Flight, Settings, TrueFlow, WHITE},
         ladder::MEANS,
         noise::{Noise, Normals},
     },
@@ -62,6 +62,8 @@ pub struct Moment {
     pub velocity: [f64; 3],
     /// rad/s, body (FLU).
     pub rates: [f64; 3],
+    /// Metres over the ground.
+    pub height: f64,
 }
 
 /// A flight without its frames.
@@ -116,8 +118,9 @@ pub fn fly(plan: Plan) -> Result<Flown, String> {
                 Sample::Info(_) | Sample::Transforms(_) => {}
             }
         }
-        truth.push(Moment { stamp: shot.truth.stamp, velocity: shot.truth.velocity, rates: shot.truth.rates });
-        flows.extend(shot.truth.flow);
+        let flight::Truth { stamp, velocity, rates, height, flow } = shot.truth;
+        truth.push(Moment { stamp, velocity, rates, height });
+        flows.extend(flow);
     }
     Ok(Flown { sensors: Sensors { plan, info, imus, ranges, truth }, frames, flows })
 }
@@ -184,5 +187,13 @@ impl Sensors {
         let rates = 0.5 * (Vector3::from(a.rates) + Vector3::from(b.rates));
         let turned = UnitQuaternion::from_scaled_axis(rates * b.stamp.seconds_since(a.stamp));
         (0.5 * (turned.inverse() * Vector3::from(a.velocity) + Vector3::from(b.velocity)), rates)
+    }
+
+    /// The angles that the ground straight below moves by in so many seconds before a frame, about the body's X and Y
+    /// (FRD): without the body's turn, and the turn.
+    pub fn below(&self, newer: usize, seconds: f64) -> [[f64; 2]; 2] {
+        let (velocity, rates) = self.mean(newer);
+        let height = 0.5 * (self.truth[newer - 1].height + self.truth[newer].height);
+        [[velocity.y, velocity.x].map(|v| (v * seconds / height).atan()), [rates.x, -rates.y].map(|w| w * seconds)]
     }
 }

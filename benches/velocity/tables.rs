@@ -6,7 +6,7 @@ use nalgebra::{Matrix6, Vector3, Vector6};
 use nightflow::{
     camera::Sample,
     darkness::ladder::MEANS,
-    motion::{BOUND_M_S, BOUND_PART, Config, Drift, Odometer, Velocity},
+    motion::{BOUND_M_S, BOUND_PART, BOUND_PER_S, Config, Drift, Odometer, Velocity},
 };
 
 use super::{
@@ -31,6 +31,17 @@ pub struct Row {
     pub found: Option<Found>,
     /// What gyro and camera disagree on so far.
     pub drift: Option<Drift>,
+    /// The flow straight below.
+    pub below: Option<Below>,
+}
+
+/// An autopilot's flow beside the truth.
+#[derive(Debug, Clone, Copy)]
+pub struct Below {
+    pub quality: u8,
+    /// Length of the error, and of the true rate without the body's turn, rad/s.
+    pub error: f64,
+    pub rate: f64,
 }
 
 #[derive(Debug, Clone)]
@@ -73,7 +84,16 @@ pub fn judge(sensors: &Sensors, seen: &Seen, config: &Config) -> Result<Vec<Row>
             }
             let size = sensors.plan.size.map(|side| side as u32);
             let velocity = odometer.velocity(&step.flow(older, newer), size).ok();
-            rows.push(Row { drift: odometer.drift(), ..row(sensors, rung, before + 1, step, velocity) });
+            let integrated = odometer.integrated(&step.flow(older, newer), size, false);
+            let seconds = newer.seconds_since(older);
+            let [moved, turned] = sensors.below(before + 1, seconds);
+            let length = |[x, y]: [f64; 2]| x.hypot(y) / seconds;
+            let below = integrated.flow.ok().map(|angles| Below {
+                quality: integrated.quality,
+                error: length([0, 1].map(|i| angles[i] - moved[i] - turned[i])),
+                rate: length(moved),
+            });
+            rows.push(Row { drift: odometer.drift(), below, ..row(sensors, rung, before + 1, step, velocity) });
         }
     }
     Ok(rows)
@@ -91,7 +111,16 @@ fn row(sensors: &Sensors, rung: usize, newer: usize, step: &Step, velocity: Opti
         let nees = [(error.transpose() * linear * error)[0], (both.transpose() * all * both)[0]];
         Found { velocity, error, nees }
     });
-    Row { plan: sensors.plan, rung, blind: step.blind, noise_level: step.noise_level, truth, found, drift: None }
+    Row {
+        plan: sensors.plan,
+        rung,
+        blind: step.blind,
+        noise_level: step.noise_level,
+        truth,
+        found,
+        drift: None,
+        below: None,
+    }
 }
 
 /// Mean, and how far it may be off: flights are independent, the steps of one are not.
@@ -136,6 +165,7 @@ pub fn report(name: &str, rows: &[Row]) -> String {
     hovering(&mut text, rows);
     honesty(&mut text, rows);
     quality(&mut text, rows);
+    straight_below(&mut text, rows);
     watch(&mut text, rows);
     text
 }
@@ -291,6 +321,33 @@ fn quality(text: &mut String, rows: &[Row]) {
     }
 }
 
+fn straight_below(text: &mut String, rows: &[Row]) {
+    let _ = writeln!(
+        text,
+        "\nThe flow straight below: its quality / 255 beside the part of the steps within {BOUND_PER_S} rad/s + {} % of the rate\n\n\
+         | | steps | mean quality | within the bound | error, median, rad/s |\n| --- | --- | --- | --- | --- |",
+        100.0 * BOUND_PART
+    );
+    let sets: [(&str, [usize; 2]); 3] = [("all", [0, 6]), ("Exp-0…3", [0, 3]), ("Exp-4…6", [4, 6])];
+    for ((name, [first, last]), bin) in sets.iter().flat_map(|set| (0..BINS).map(move |bin| (set, bin))) {
+        let here: Vec<(u64, Below)> = rows
+            .iter()
+            .filter(|row| (first..=last).contains(&&row.rung))
+            .filter_map(|row| Some((row.plan.number, row.below?)))
+            .filter(|(_, below)| usize::from(below.quality) * BINS / 256 == bin)
+            .collect();
+        if here.is_empty() {
+            continue;
+        }
+        let quality = here.iter().map(|(_, below)| f64::from(below.quality) / 255.0).sum::<f64>() / here.len() as f64;
+        let hit = |below: &Below| f64::from(u8::from(below.error <= BOUND_PER_S + BOUND_PART * below.rate));
+        let hits: Vec<(u64, f64)> = here.iter().map(|(number, below)| (*number, hit(below))).collect();
+        let (part, error) = mean(&hits);
+        let median = quantile(here.iter().map(|(_, below)| below.error).collect(), 0.5);
+        let _ = writeln!(text, "| {name} | {} | {quality:.3} | {part:.3} ± {error:.3} | {median:.4} |", here.len());
+    }
+}
+
 /// Every row as a line of a table for other programs.
 pub fn csv(name: &str, rows: &[Row]) -> String {
     let mut text = String::new();
@@ -314,6 +371,9 @@ pub fn csv(name: &str, rows: &[Row]) -> String {
             );
             for (i, j) in [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)] {
                 let _ = write!(text, ",{}", velocity.covariance[i][j]);
+            }
+            if let Some(Below { quality, error, rate }) = row.below {
+                let _ = write!(text, ",{quality},{error},{rate}");
             }
         }
         text.push('\n');

@@ -48,11 +48,7 @@ impl Fit {
             stretch += sight.stretch * sight.stretch;
             count += 1.0;
         }
-        // Of twice as many equations as there are independent vectors the fit used up D. A fit follows what is smooth:
-        // the residuals are smaller by that part, and the sums of their correlations along columns and rows too.
-        let apparent = self.likeness();
-        let independent = count / apparent;
-        let likeness = apparent * (independent / f64::max(independent - 0.5 * D as f64, 1.0)).powi(3);
+        let likeness = unfitted(self.likeness(), count, D);
         noise *= likeness;
         if let Some(sd) = lean_sd {
             let prior = likeness * (spread / sd).powi(2);
@@ -87,51 +83,66 @@ impl Fit {
         })
     }
 
-    /// How many vectors stand for one independent vector: residuals that are alike carry no new knowledge.
-    ///
-    /// The sum of the residuals' autocorrelation over all distances, taken as separable along columns and rows. Each
-    /// sum ends where the correlation first falls to zero (Geyer's initial positive sequence): a network's error is
-    /// smooth over several cells and then ends, so that neither its nearest neighbours (as a first-order autoregression
-    /// would have it, three times too many) nor blocks of the image (too few) say how far it reaches.
+    /// How many vectors stand for one independent vector.
     pub(super) fn likeness(&mut self) -> f64 {
         self.scaled.clear();
         self.scaled.extend(self.sights.iter().map(|sight| match sight.offered && sight.agrees {
             true => sight.residual.map(|off| off * sight.weight.sqrt()),
             false => [f64::NAN; 2],
         }));
-        let rows = self.sights.len() / self.columns.max(1);
-        let mut factor = 1.0;
-        for (along_row, cells) in [(true, self.columns), (false, rows)] {
-            let mut sum = 1.0;
-            for lag in 1..cells {
-                let correlation = if along_row { self.alike(lag, lag) } else { self.alike(lag * self.columns, 0) };
-                if correlation <= 0.0 {
-                    break;
-                }
-                sum += 2.0 * correlation * (1.0 - lag as f64 / cells as f64);
-            }
-            factor *= sum;
-        }
-        factor
+        likeness(&self.scaled, self.columns)
     }
+}
 
-    /// Correlation of the residuals of vectors that lie `apart` places from each other in the raster; the last `edge`
-    /// columns have no partner in their row.
-    fn alike(&self, apart: usize, edge: usize) -> f64 {
-        let (mut product, mut square) = (0.0, 0.0);
-        let partners = self.scaled.get(apart..).unwrap_or_default();
-        let both = self.scaled.chunks(self.columns).zip(partners.chunks(self.columns));
-        for (here, there) in both {
-            for ([ax, ay], [bx, by]) in here.iter().zip(there).take(self.columns - edge) {
-                let pair = ax * bx + ay * by;
-                if pair.is_finite() {
-                    product += pair;
-                    square += 0.5 * (ax * ax + ay * ay + bx * bx + by * by);
-                }
+/// How many vectors of a raster stand for one independent vector: residuals that are alike carry no new knowledge.
+/// `scaled` are residuals over their spread, row by row, NaN where none agrees.
+///
+/// The sum of the residuals' autocorrelation over all distances, taken as separable along columns and rows. Each
+/// sum ends where the correlation first falls to zero (Geyer's initial positive sequence): a network's error is
+/// smooth over several cells and then ends, so that neither its nearest neighbours (as a first-order autoregression
+/// would have it, three times too many) nor blocks of the image (too few) say how far it reaches.
+pub(super) fn likeness(scaled: &[[f64; 2]], columns: usize) -> f64 {
+    let rows = scaled.len() / columns.max(1);
+    let mut factor = 1.0;
+    for (along_row, cells) in [(true, columns), (false, rows)] {
+        let mut sum = 1.0;
+        for lag in 1..cells {
+            let [apart, edge] = if along_row { [lag, lag] } else { [lag * columns, 0] };
+            let correlation = alike(scaled, columns, apart, edge);
+            if correlation <= 0.0 {
+                break;
+            }
+            sum += 2.0 * correlation * (1.0 - lag as f64 / cells as f64);
+        }
+        factor *= sum;
+    }
+    factor
+}
+
+/// Correlation of the residuals of vectors that lie `apart` places from each other in the raster; the last `edge`
+/// columns have no partner in their row.
+fn alike(scaled: &[[f64; 2]], columns: usize, apart: usize, edge: usize) -> f64 {
+    let (mut product, mut square) = (0.0, 0.0);
+    let partners = scaled.get(apart..).unwrap_or_default();
+    for (here, there) in scaled.chunks(columns).zip(partners.chunks(columns)) {
+        for ([ax, ay], [bx, by]) in here.iter().zip(there).take(columns - edge) {
+            let pair = ax * bx + ay * by;
+            if pair.is_finite() {
+                product += pair;
+                square += 0.5 * (ax * ax + ay * ay + bx * bx + by * by);
             }
         }
-        if square > 0.0 { product / square } else { 0.0 }
     }
+    if square > 0.0 { product / square } else { 0.0 }
+}
+
+/// The likeness of `count` vectors' errors where that of their residuals is `apparent`.
+///
+/// Of twice as many equations as there are independent vectors the fit used up its unknowns. A fit follows what is
+/// smooth: the residuals are smaller by that part, and the sums of their correlations along columns and rows too.
+pub(super) fn unfitted(apparent: f64, count: f64, unknowns: usize) -> f64 {
+    let independent = count / apparent;
+    apparent * (independent / f64::max(independent - 0.5 * unknowns as f64, 1.0)).powi(3)
 }
 
 /// The inverse, unless the matrix is singular beside its own size.

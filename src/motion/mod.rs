@@ -17,6 +17,7 @@ mod linear;
 mod mounting;
 pub mod obstacles;
 mod odometer;
+mod plane;
 mod quality;
 
 pub use config::{AttitudeUse, Config, GyroUse, Mount, REASONS};

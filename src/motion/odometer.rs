@@ -8,10 +8,10 @@ use super::{
     fit::{Fit, Found, Sight},
     ground::Ranges,
     gyro::{Rates, Turn},
-    integrated::Below,
     lens::Lens,
     mounting::Mounting,
     obstacles::Sighting,
+    plane::Plane,
     quality,
 };
 use crate::{
@@ -45,7 +45,7 @@ pub struct Odometer {
     pub(super) rates: Rates,
     ranges: Ranges,
     fit: Fit,
-    pub(super) below: Below,
+    pub(super) plane: Plane,
     watch: Watch,
     /// From a frame's stamp to the middle of its exposure.
     half_exposure_ns: i64,
@@ -113,7 +113,7 @@ impl Odometer {
             rates: Rates::new(imu),
             ranges: Ranges::new(),
             fit: Fit::default(),
-            below: Below::default(),
+            plane: Plane::default(),
             watch: Watch::default(),
             half_exposure_ns: 0,
         })

@@ -2,7 +2,7 @@
 
 use std::f64::consts::SQRT_2;
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix2, Matrix3, Vector3};
 
 use super::Scale;
 
@@ -20,6 +20,14 @@ pub(super) fn of(linear: &Vector3<f64>, covariance: &Matrix3<f64>, scale: &Scale
         Scale::PerDistance(_) => BOUND_PER_S,
     };
     (255.0 * within(covariance, constant + BOUND_PART * linear.norm())).round() as u8
+}
+
+/// 255 × the probability that two angular rates' error is within the bound of a velocity per distance; `left` is what a
+/// gyro leaves of them, rad/s. At least 1, for 0 says that there are none.
+pub(super) fn of_rates(left: [f64; 2], covariance: &Matrix2<f64>) -> u8 {
+    let bound = BOUND_PER_S + BOUND_PART * (left[0] * left[0] + left[1] * left[1]).sqrt();
+    let covariance = covariance.fixed_resize::<3, 3>(0.0);
+    ((255.0 * within(&covariance, bound)).round() as u8).max(1)
 }
 
 /// The probability that a normal error of this covariance is no longer than `bound`.
