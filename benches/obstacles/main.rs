@@ -13,6 +13,7 @@ use std::{
 
 use nightflow::{
     darkness::{noise::Noise, profiles},
+    flow,
     motion::obstacles,
 };
 
@@ -39,6 +40,8 @@ pub struct Asked {
     size: [usize; 2],
     csv: Option<PathBuf>,
     plot: Option<PathBuf>,
+    /// Settings of `[flow]` that differ, as TOML.
+    flow: flow::Config,
     /// Settings of `[motion.obstacles]` that differ, as TOML; each is judged on the same flow.
     variants: Vec<String>,
 }
@@ -58,6 +61,7 @@ impl Asked {
             size: if bench { [640, 480] } else { [320, 256] },
             csv: None,
             plot: None,
+            flow: flow::Config::default(),
             variants: vec![],
         };
         let list = |value: &String| value.split(',').map(str::to_owned).collect::<Vec<String>>();
@@ -74,10 +78,11 @@ impl Asked {
                 "--methods" => asked.methods = list(value),
                 "--csv" => asked.csv = Some(value.into()),
                 "--plot" => asked.plot = Some(value.into()),
+                "--flow" => asked.flow = toml::from_str(value).map_err(|error| error.to_string())?,
                 "--obstacles" => asked.variants.push(value.clone()),
                 _ => {
                     return Err(format!(
-                        "{word} is not known: --seeds --frames --threads --courses {} --exposures --methods --csv --plot --obstacles",
+                        "{word} is not known: --seeds --frames --threads --courses {} --exposures --methods --csv --plot --flow --obstacles",
                         COURSES.join(",")
                     ));
                 }
@@ -113,7 +118,8 @@ impl Asked {
 /// One thread's share: courses as they are free.
 fn work(asked: &Asked, plans: &[Plan], camera: &Noise, next: &AtomicUsize) -> Result<Vec<Row>, String> {
     let configs = asked.configs()?;
-    let mut matchers = asked.methods.iter().map(|name| seen::matcher(name)).collect::<Result<Vec<_>, _>>()?;
+    let mut matchers =
+        asked.methods.iter().map(|name| seen::matcher(name, &asked.flow)).collect::<Result<Vec<_>, _>>()?;
     let mut rows = vec![];
     while let Some(plan) = plans.get(next.fetch_add(1, Ordering::Relaxed)) {
         let flown = seen::fly(plan)?;

@@ -26,11 +26,15 @@ pub struct Row {
     pub sector: usize,
     /// Seconds, where something nears.
     pub truth: Option<f64>,
+    /// The soonest here and beside.
+    pub soonest: Option<f64>,
     /// Nothing nears in the sectors beside it either.
     pub clear: bool,
     pub found: Sector,
-    /// The most certain word of an obstacle here or a sector beside: a thing at the edge may be seen in either.
+    /// The most certain word of an obstacle here or a sector beside, for a thing at the edge may be seen in either; and
+    /// the soonest time that is told there with certainty.
     pub near: f64,
+    pub near_s: Option<f64>,
 }
 
 impl Row {
@@ -48,6 +52,10 @@ impl Row {
             Sector::Occupied { confidence, .. } => confidence,
             _ => 0.0,
         };
+        let time = |sector: usize| match said(sector) {
+            Sector::Occupied { ttc_s, confidence, .. } if confidence >= SURE => Some(ttc_s),
+            _ => None,
+        };
         let beside = |sector: usize| sector - 1..=sector + 1;
         let inside = (1..truth.sectors.len() - 1).filter(|sector| truth.in_view[*sector]);
         let row = |sector: usize| Row {
@@ -59,9 +67,11 @@ impl Row {
             step,
             sector,
             truth: truth.sectors[sector],
+            soonest: beside(sector).filter_map(|near| truth.sectors[near]).min_by(f64::total_cmp),
             clear: beside(sector).all(|near| truth.sectors[near].is_none_or(|ttc| ttc > CLEAR_S)),
             found: said(sector),
             near: beside(sector).map(sure).fold(0.0, f64::max),
+            near_s: beside(sector).filter_map(time).min_by(f64::total_cmp),
         };
         inside.map(row).collect()
     }
@@ -111,15 +121,8 @@ pub fn rates<'a>(rows: impl Iterator<Item = &'a Row>, sure: f64) -> Rates {
 
 /// Median and third quartile of the relative error of times to contact that were told, and how many there are.
 fn errors<'a>(rows: impl Iterator<Item = &'a Row>) -> (f64, f64, usize) {
-    let mut errors: Vec<f64> = rows
-        .filter(|row| row.due())
-        .filter_map(|row| match (row.found, row.truth) {
-            (Sector::Occupied { ttc_s, confidence, .. }, Some(truth)) if confidence >= SURE => {
-                Some((ttc_s / truth - 1.0).abs())
-            }
-            _ => None,
-        })
-        .collect();
+    let mut errors: Vec<f64> =
+        rows.filter(|row| row.due()).filter_map(|row| Some((row.near_s? / row.soonest? - 1.0).abs())).collect();
     errors.sort_by(f64::total_cmp);
     let at = |part: f64| errors.get((errors.len() as f64 * part) as usize).copied().unwrap_or(f64::NAN);
     (at(0.5), at(0.75), errors.len())

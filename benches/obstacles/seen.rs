@@ -11,7 +11,7 @@ use nightflow::{
         noise::{Noise, Normals},
     },
     exposure::Developer,
-    flow::{Matcher, Own, State},
+    flow::{self, Matcher, Own, State},
     motion::{Lack, Lookout, Mount, Odometer, obstacles},
 };
 
@@ -24,6 +24,8 @@ use super::{
 pub const COURSES: [&str; 4] = ["wall", "poles", "wire", "moving"];
 /// Mean of the clean frames, from which the ladder's are made: no highlight is lost.
 const CLEAN: f64 = 0.1;
+/// No obstacle for the whole flight.
+const BACKDROP_M: f64 = 80.0;
 /// The filter, the heading and the camera's noise need some frames.
 const WARM_UP: usize = 4;
 
@@ -46,7 +48,7 @@ pub struct Flown {
 pub fn fly(plan: &Plan) -> Result<Flown, String> {
     let mut draws = Normals::new(plan.seed, 0x0b57);
     let mut within = |from: f64, to: f64| from + (to - from) * draws.uniform();
-    let things = match plan.course.as_str() {
+    let mut things: Vec<Thing> = match plan.course.as_str() {
         "wall" => vec![Thing::wall(within(13.5, 15.5))],
         "poles" => (0..3)
             .map(|k| Thing::pole(within(12.0, 16.0), (f64::from(k) - 1.0) * 3.0 + within(-1.0, 1.0), within(0.25, 0.6)))
@@ -57,6 +59,10 @@ pub fn fly(plan: &Plan) -> Result<Flown, String> {
             Thing::pole(within(18.0, 20.0), within(1.5, 2.5), 1.0).moving([within(-1.5, -1.0), 0.0, 0.0]),
         ],
     };
+    if plan.course != "wall" {
+        // Houses far behind: what is open shows something, or nothing there could ever be called free.
+        things.push(Thing::wall(BACKDROP_M));
+    }
     let settings =
         Settings { seed: plan.seed, size: plan.size, mean: CLEAN, noise: None, things, ..Settings::default() };
     let mut course = Course::new(settings).map_err(|error| error.to_string())?;
@@ -89,9 +95,11 @@ impl Flown {
     }
 }
 
-/// Settings of the node for the course's camera.
-fn settings(network: &str) -> Config {
-    let mut config = Config::default();
+/// Settings of the node for the course's camera; `flow` holds those of `[flow]` that differ.
+fn settings(network: &str, flow: &flow::Config) -> Config {
+    let mut config = Config { flow: flow.clone(), ..Config::default() };
+    // Rivals are judged as they are.
+    config.flow.refine &= !METHODS.contains(&network);
     config.exposure.bit_depth = Some(12);
     config.exposure.black_level = Some(f32::from(BLACK));
     config.exposure.white_level = Some(f32::from(WHITE));
@@ -102,8 +110,8 @@ fn settings(network: &str) -> Config {
 }
 
 /// A network of ours, or OpenCV's flow.
-pub fn matcher(name: &str) -> Result<Matcher, String> {
-    let config = settings(name);
+pub fn matcher(name: &str, flow: &flow::Config) -> Result<Matcher, String> {
+    let config = settings(name, flow);
     match METHODS.contains(&name) {
         true => Ok(Matcher::with(&config.flow, Box::new(OpenCv::open(name)?))),
         false => Matcher::open(&config.flow).map_err(|error| error.to_string()),
@@ -121,7 +129,7 @@ pub fn look(
     variants: &[obstacles::Config],
 ) -> Result<Vec<Row>, String> {
     let say = |error: &dyn std::fmt::Display| error.to_string();
-    let config = settings(name);
+    let config = settings(name, &flow::Config::default());
     let mut developer = Developer::new(&config.exposure).map_err(|error| say(&error))?;
     let mut odometer = Odometer::new(&config.motion).map_err(|error| say(&error))?;
     let lookouts = variants.iter().map(Lookout::new).collect::<Result<Vec<_>, _>>();

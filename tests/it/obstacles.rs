@@ -37,6 +37,8 @@ struct Course {
     odometer: Odometer,
     lookout: Lookout,
     metric: bool,
+    /// m/s, along each axis.
+    speed_sd: f64,
     /// Pixels of noise on every component of the flow.
     noise_px: f64,
     image: Exposed,
@@ -90,6 +92,7 @@ impl Course {
             odometer,
             lookout: Lookout::new(&obstacles::Config::default()).unwrap(),
             metric: true,
+            speed_sd: 0.05,
             noise_px: 0.0,
             image: textured(1),
             draws: Normals::new(1, 2),
@@ -139,7 +142,9 @@ impl Course {
             newer,
             linear: (turned.inverse() * self.velocity).into(),
             angular: self.rates.into(),
-            covariance: [[0.0; 6]; 6],
+            covariance: std::array::from_fn(|i| {
+                std::array::from_fn(|j| if i == j { self.speed_sd.powi(2) } else { 0.0 })
+            }),
             scale: match self.metric {
                 true => Scale::Metric { distance: HEIGHT },
                 false => Scale::PerDistance(nightflow::motion::NoDistance::Missing),
@@ -282,7 +287,9 @@ fn noise_widens_and_does_not_bias() {
     let ttc = (9.0 - course.position.x) / 3.0;
     for k in 32..=40 {
         let (ttc_s, _) = occupied(found.sectors[k]).unwrap_or_else(|| panic!("{k}: {:?}", found.sectors));
-        assert!(close(ttc_s, ttc, 0.1), "sector {k}: {ttc_s} for {ttc} s");
+        // Ahead little moves, and what is told there is the nearest that it may be.
+        let allowed = if (35..=37).contains(&k) { 0.15 } else { 0.1 };
+        assert!(close(ttc_s, ttc, allowed), "sector {k}: {ttc_s} for {ttc} s");
     }
 }
 
@@ -293,6 +300,21 @@ fn without_metres_there_are_times_and_no_distances() {
     let found = course.steps(4);
     let (ttc_s, distance_m) = occupied(found.sectors[36]).unwrap();
     assert!(close(ttc_s, (9.0 - course.position.x) / 3.0, 0.05) && distance_m.is_nan() && found.speed.is_none());
+}
+
+#[test]
+fn a_speed_that_is_hardly_known_makes_no_distances_for_long() {
+    let mut course = Course::new(wall(12.0));
+    let known = course.steps(4);
+    assert!(known.speed.is_some() && occupied(known.sectors[36]).unwrap().1.is_finite());
+    // The wall hides the ground: what the fit makes of it is worth nothing, and its covariance says so.
+    course.speed_sd = 2.0;
+    let held = course.steps(8);
+    assert!(held.speed == known.speed && occupied(held.sectors[36]).unwrap().1.is_finite(), "{held:?}");
+    let lost = course.steps(12);
+    let (ttc_s, distance_m) = occupied(lost.sectors[36]).unwrap();
+    assert!(lost.speed.is_none() && distance_m.is_nan(), "{lost:?}");
+    assert!(close(ttc_s, (12.0 - course.position.x) / 3.0, 0.05), "{ttc_s}");
 }
 
 #[test]

@@ -20,6 +20,8 @@ pub struct Config {
     pub elevation_rad_max: f64,
     /// Nothing is said of what is further away than this where speed is metric.
     pub reach_m_max: f64,
+    /// A speed over ground that is not known any more holds for so long.
+    pub speed_hold_s: f64,
     /// The fewest cells of the flow that make a surface.
     pub cells_min: usize,
     /// The least part of a sector's cells that make a surface.
@@ -53,12 +55,13 @@ impl Default for Config {
             above_m: 1.0,
             elevation_rad_max: 0.1,
             reach_m_max: 40.0,
+            speed_hold_s: 1.0,
             cells_min: 5,
             cells_part_min: 0.04,
-            seen_part_min: 0.5,
+            seen_part_min: 0.6,
             texture_sd_px_max: 0.5,
             likeness_cells: 9.0,
-            shared_px: 0.2,
+            shared_px: 0.1,
             heading_sd_rad_max: 0.15,
             mover_sds: 4.0,
             mover_px_min: 0.5,
@@ -76,9 +79,13 @@ pub const REASONS: &[(&str, &str)] = &[
     ("obstacles.above_m", "the same upwards"),
     ("obstacles.elevation_rad_max", "6°: a metre above or below at ten metres"),
     ("obstacles.reach_m_max", "at 40 m a metre is 10 pixels of a 640-pixel camera, 1 cell of the flow"),
+    (
+        "obstacles.speed_hold_s",
+        "near a wall no ground is seen; within a second a braking vehicle loses a few m/s, and then only times are told",
+    ),
     ("obstacles.cells_min", "single cells are wild too often"),
     ("obstacles.cells_part_min", "a pole of a fifth of a degree in a sector of five"),
-    ("obstacles.seen_part_min", "what hides in the unseen half may be in the way"),
+    ("obstacles.seen_part_min", "what hides in the unseen part may be in the way"),
     (
         "obstacles.texture_sd_px_max",
         "twice the network's own error in good light: flow beyond is filled in from elsewhere",
@@ -86,7 +93,7 @@ pub const REASONS: &[(&str, &str)] = &[
     ("obstacles.likeness_cells", "networks' errors are smooth over about three cells along either side"),
     (
         "obstacles.shared_px",
-        "what a network errs alike in all of the image in the dark (cargo bench --bench obstacles)",
+        "what is left after refining in the dark (cargo bench --bench obstacles); without it, twice as much",
     ),
     ("obstacles.heading_sd_rad_max", "9°: beyond, the focus of expansion is anywhere in the middle of the image"),
     ("obstacles.mover_sds", "one of 16,000 vectors of what stands still, were they independent"),

@@ -31,6 +31,10 @@ use texture::Texture;
 /// Sectors of five degrees; sector k looks along −π + k · 2π/72, counter-clockwise from above, so that 36 looks forward.
 pub const SECTORS: usize = 72;
 
+/// A speed that may be off by more than this part of itself makes no distances: where a wall fills the view there is no
+/// ground to measure it by.
+const SPEED_SD_PART_MAX: f64 = 0.25;
+
 /// The most cells that are looked at; a finer raster is thinned evenly.
 const CELLS_MAX: usize = 8000;
 
@@ -133,6 +137,8 @@ pub struct Lookout {
     movers: Movers,
     sectors: Sectors,
     memory: Option<(Stamp, Memory)>,
+    /// When speed was last known well, and how fast it was then.
+    speed: Option<(Stamp, f64)>,
     newest: Option<Stamp>,
     order: Vec<u32>,
     lengths: Vec<f64>,
@@ -173,6 +179,7 @@ impl Lookout {
             movers: Movers::default(),
             sectors: Sectors::new(),
             memory: None,
+            speed: None,
             newest: None,
             order: Vec::new(),
             lengths: Vec::new(),
@@ -193,7 +200,7 @@ impl Lookout {
         self.closing.clear();
         if self.newest.is_some_and(|newest| newest != flow.older) {
             // Steps are missing between: how the body turned there is not known.
-            (self.memory, self.newest) = (None, None);
+            (self.memory, self.newest, self.speed) = (None, None, None);
             self.sectors.forget();
         }
         let sighting = odometer.sighting(flow, camera_size)?;
@@ -228,7 +235,11 @@ impl Lookout {
             cell.measure(&scene);
         }
         self.movers.find(&mut self.cells, self.columns, &scene);
-        let speed = metric(velocity);
+        if let Some(speed) = metric(velocity) {
+            self.speed = Some((flow.newer, speed));
+        }
+        let recent = |(stamp, _): &(Stamp, f64)| flow.newer.seconds_since(*stamp) <= self.config.speed_hold_s;
+        let speed = self.speed.filter(recent).map(|(_, speed)| speed);
         let corridor = Corridor::new(&self.config, speed);
         self.sectors.gather(&self.cells, &scene, &corridor);
         self.sectors.update(&self.cells, &scene, &corridor);
@@ -347,11 +358,13 @@ fn yaw(level: &Matrix3<f64>, turn: &UnitQuaternion<f64>) -> f64 {
     turn.scaled_axis().dot(&up)
 }
 
+/// The speed where it is metric and known well.
 fn metric(velocity: &Result<Velocity, Lack>) -> Option<f64> {
-    match velocity {
-        Ok(Velocity { scale: Scale::Metric { .. }, linear, .. }) => Some(Vector3::from(*linear).norm().max(1e-3)),
-        _ => None,
-    }
+    let Ok(Velocity { scale: Scale::Metric { .. }, linear, covariance, .. }) = velocity else { return None };
+    let linear = Vector3::from(*linear);
+    let (speed, spread) = (linear.norm(), Matrix3::from_fn(|i, j| covariance[i][j]));
+    let sd = (linear.dot(&(spread * linear)) / (speed * speed).max(1e-12)).max(0.0).sqrt();
+    (sd <= SPEED_SD_PART_MAX * speed).then_some(speed.max(1e-3))
 }
 
 /// The nearest sector of an azimuth, radians.

@@ -9,6 +9,8 @@ use super::{
 
 /// Cells within this many deviations are of one surface.
 const SURFACE_SDS: f64 = 2.5;
+/// The part of an error that all vectors share by which those of one sector differ.
+const APART_PART: f64 = 0.25;
 const ROUNDS: usize = 6;
 /// A sector whose deviation is below this part of the inverse horizon needs no wider view.
 const SURE_PART: f64 = 0.3;
@@ -103,7 +105,7 @@ impl Sectors {
     pub(super) fn predict(&mut self, seconds: f64, yaw: f64, config: &Config) {
         for track in &mut self.tracks {
             track.age_s += seconds;
-            track.alive &= track.age_s <= 2.0 * config.delay_s;
+            track.alive &= track.age_s <= config.delay_s;
             let nearer = 1.0 - track.closing * seconds;
             if nearer > 0.2 {
                 track.closing /= nearer;
@@ -171,8 +173,9 @@ impl Sectors {
             return None;
         }
         let cell = |i: &u32| &cells[*i as usize];
-        let sd = |cell: &Cell| hypot(cell.sd, shared * cell.by_shift.norm());
-        let least = |i: &u32| cell(i).closing - 2.0 * sd(cell(i));
+        // What all vectors share moves neighbours alike, and does not set them apart.
+        let sd = |cell: &Cell| hypot(cell.sd, APART_PART * shared * cell.by_shift.norm());
+        let least = |i: &u32| cell(i).closing - 2.0 * hypot(cell(i).sd, shared * cell(i).by_shift.norm());
         self.order.sort_unstable_by(|a, b| least(b).total_cmp(&least(a)).then(a.cmp(b)));
         let mut closing = cell(&self.order[needed - 1]).closing;
         let within = |i: &&u32, closing: f64| (cell(i).closing - closing).abs() <= SURFACE_SDS * sd(cell(i));

@@ -7,6 +7,9 @@ const BIN: usize = 2;
 /// Bins beyond each side of the cell that count for it, as a part of the cell's own width.
 const MARGIN: f32 = 1.0;
 
+/// A cell whose own texture is for certain below this part of what lies around it shows its neighbours' motion.
+const OWN_MIN: f64 = 0.2;
+
 /// Information about a displacement: xx, xy, yy of Σ∇I∇Iᵀ over twice the variance, 1 / (developed pixel)².
 pub(super) type Information = [f64; 3];
 
@@ -97,19 +100,29 @@ impl Texture {
         Some([gx * gx, gx * gy, gy * gy, 0.125 * noise, f64::from(self.variance[at]), 1.0])
     }
 
-    /// What a cell at camera pixel `centre`, `size` camera pixels wide and high, knows of its displacement.
-    pub(super) fn at(&self, centre: [f32; 2], size: [f32; 2]) -> Information {
+    /// Sums over the bins within `half` camera pixels of `centre`.
+    fn window(&self, centre: [f32; 2], half: [f32; 2]) -> [f64; 6] {
         let width = self.columns + 1;
         let side = |i: usize, most: usize| {
-            let half = (0.5 + MARGIN) * size[i];
             let bin = |pixel: f32| ((pixel + 0.5) / self.scale[i]).round().clamp(0.0, most as f32) as usize;
-            [bin(centre[i] - half), bin(centre[i] + half)]
+            [bin(centre[i] - half[i]), bin(centre[i] + half[i])]
         };
         let ([left, right], [top, bottom]) = (side(0, self.columns), side(1, self.rows));
         let corner = |column: usize, row: usize, i: usize| self.sums.get(row * width + column).map_or(0.0, |s| s[i]);
         let sum = |i| corner(right, bottom, i) - corner(left, bottom, i) - corner(right, top, i) + corner(left, top, i);
-        let [xx, xy, yy, noise, variance, count]: [f64; 6] = std::array::from_fn(sum);
-        if count < 1.0 {
+        std::array::from_fn(sum)
+    }
+
+    /// What a cell at camera pixel `centre`, `size` camera pixels wide and high, knows of its displacement.
+    pub(super) fn at(&self, centre: [f32; 2], size: [f32; 2]) -> Information {
+        let [xx, xy, yy, noise, variance, count] = self.window(centre, size.map(|side| (0.5 + MARGIN) * side));
+        let own = self.window(centre, size.map(|side| 0.5 * side));
+        if count < 1.0 || own[5] < 1.0 {
+            return [0.0; 3];
+        }
+        // Two axes have twice the noise of one, and twice the deviation of a sum of squares is the benefit of the doubt.
+        let shown = own[0] + own[2] - 2.0 * own[3] * (1.0 - 2.0 * (1.0 / own[5]).sqrt());
+        if shown < OWN_MIN * (xx + yy - 2.0 * noise) * own[5] / count {
             return [0.0; 3];
         }
         // What noise alone makes of a sum of squares, and twice the deviation of that.
