@@ -58,8 +58,8 @@ impl Default for Config {
             speed_hold_s: 1.0,
             cells_min: 5,
             cells_part_min: 0.04,
-            seen_part_min: 0.6,
-            texture_sd_px_max: 0.5,
+            seen_part_min: 0.5,
+            texture_sd_px_max: 1.0,
             likeness_cells: 9.0,
             shared_px: 0.1,
             heading_sd_rad_max: 0.15,
@@ -85,10 +85,10 @@ pub const REASONS: &[(&str, &str)] = &[
     ),
     ("obstacles.cells_min", "single cells are wild too often"),
     ("obstacles.cells_part_min", "a pole of a fifth of a degree in a sector of five"),
-    ("obstacles.seen_part_min", "what hides in the unseen part may be in the way"),
+    ("obstacles.seen_part_min", "what hides in the unseen half may be in the way"),
     (
         "obstacles.texture_sd_px_max",
-        "twice the network's own error in good light: flow beyond is filled in from elsewhere",
+        "a pixel along the line through the focus of expansion: flow beyond is filled in from elsewhere; half of it leaves too little of a dark image",
     ),
     ("obstacles.likeness_cells", "networks' errors are smooth over about three cells along either side"),
     (
