@@ -17,7 +17,6 @@ from networks import PwcNet
 from raft import RaftSmall
 
 OPSET = 17
-LEVEL_NAMES = [f"level{level}" for level in range(2, 7)]
 FRAMES = ("older", "newer")
 LARGEST_FILE = 20_000_000
 PARITY_PX = 1e-3
@@ -27,40 +26,34 @@ GOLDEN_TOLERANCE = 0.02
 
 
 class FrameGraph(nn.Module):
-    """PWC-Net's pyramid behind the interface that the node uses: five levels, whatever the network's coarsest is.
+    """PWC-Net's pyramid: what is matched at levels 2 and 3, and context."""
 
-    Levels that the network has not are given as averages of the coarsest, and nobody reads them.
-    """
-
-    names = LEVEL_NAMES
+    names = ["match_level2", "match_level3", "context_level3"]
 
     def __init__(self, network: PwcNet):
         super().__init__()
         self.pyramid = network.pyramid
 
     def forward(self, image):
-        features = list(self.pyramid(image))
-        while len(features) < len(LEVEL_NAMES):
-            features.append(nn.functional.avg_pool2d(features[-1], 2))
-        return tuple(features)
+        return self.pyramid(image)
 
 
 class PairGraph(nn.Module):
-    """PWC-Net's decoder behind the interface that the node uses.
-
-    Ten feature maps and `scale` [2] (camera pixels per network pixel) to flow [1, H/4, W/4, 2] in camera pixels and
-    the expected end-point error [1, H/4, W/4] in network pixels.
-    """
-
-    names = [f"{frame}_{name}" for frame in FRAMES for name in LEVEL_NAMES]
+    """PWC-Net's decoder: features to flow [1, H/4, W/4, 2] in camera pixels, by `scale` [2] (camera pixels per network
+    pixel), and the expected end-point error [1, H/4, W/4] in network pixels. The fast one reads no level 2."""
 
     def __init__(self, network: PwcNet):
         super().__init__()
-        self.decoder = network.decoder
+        self.decoder, self.fast = network.decoder, network.fast
+        self.names = [f"{frame}_match_level3" for frame in FRAMES] + ["older_context_level3"]
+        if not self.fast:
+            self.names += [f"{frame}_match_level2" for frame in FRAMES]
 
-    def forward(self, *inputs):
-        flows, expected = self.decoder(inputs[:5], inputs[5:10])
-        return (4.0 * flows[-1]).permute(0, 2, 3, 1) * inputs[10], expected[:, 0]
+    def forward(self, older, newer, context, *rest):
+        *level2, scale = rest
+        of = lambda matched, n: (None if self.fast else level2[n], matched, context)
+        flows, expected = self.decoder(of(older, 0), of(newer, 1), self.fast)
+        return (4.0 * flows[-1]).permute(0, 2, 3, 1) * scale, expected[:, 0]
 
 
 class RaftFrameGraph(nn.Module):
@@ -130,17 +123,6 @@ def traced(module: nn.Module, inputs: tuple, names: list[str], outputs: list[str
     return onnx.load_from_string(memory.getvalue())
 
 
-def declare(decoder: onnx.ModelProto, inputs: dict[str, torch.Tensor]) -> None:
-    """Puts the inputs that a shallow network does not read back into the decoder's interface, in order."""
-    present = {i.name: i for i in decoder.graph.input}
-    for name, feature in inputs.items():
-        level = name[name.index("level") :]
-        shape = [1, feature.shape[1], f"rows_{level}", f"columns_{level}"]
-        present.setdefault(name, onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape))
-    del decoder.graph.input[:]
-    decoder.graph.input.extend(present[name] for name in [*inputs, "scale"])
-
-
 def graphs_of(network: nn.Module) -> dict[str, onnx.ModelProto]:
     """`pyramid` and `decoder` graphs of a network in evaluation mode."""
     graphs = (RaftFrameGraph, RaftPairGraph) if isinstance(network, RaftSmall) else (FrameGraph, PairGraph)
@@ -162,7 +144,6 @@ def graphs_of(network: nn.Module) -> dict[str, onnx.ModelProto]:
         pair, (*inputs.values(), torch.ones(2)), [*inputs, "scale"], ["flow", "uncertainty"],
         {"flow": raster, "uncertainty": raster, **{name: axes(name) for name in inputs}},
     )
-    declare(decoder, inputs)
     return {"pyramid": with_half_weights(pyramid), "decoder": with_half_weights(decoder)}
 
 
@@ -257,14 +238,15 @@ def main() -> None:
         raise SystemExit(f"{arguments.checkpoint}: holds a {state['kind']}; --iterations is for raftsmall, and needed there")
     arguments.models.mkdir(parents=True, exist_ok=True)
     if state["kind"] == "pwcnet":
-        export(arguments, PwcNet(state["coarsest"]), state, arguments.name)
+        export(arguments, PwcNet(), state, arguments.name)
+        export(arguments, PwcNet(fast=True), state, f"{arguments.name}_fast")
     for iterations in arguments.iterations or []:
         first = iterations == arguments.iterations[0]
         export(arguments, RaftSmall(iterations), state, arguments.name if first else f"{arguments.name}_{iterations}")
 
 
 def export(arguments: argparse.Namespace, network: nn.Module, state: dict, name: str) -> None:
-    """Writes, checks and enters one network. RAFT-small's numbers of iterations share the pyramid's file."""
+    """Writes, checks and enters one network. Those with the same weights share the pyramid's file."""
     network.eval().load_state_dict(state["mean"])
     files = {}
     for part, graph in graphs_of(network).items():

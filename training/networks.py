@@ -1,80 +1,83 @@
-"""PWC-Net "small" for dark raw frames, as a pyramid (once a frame) and a decoder (once a pair).
+"""PWC-Net for dark raw frames, as a pyramid (once a frame) and a decoder (once a pair).
 
-Layout as in Sun et al. 2018 without dense connections: cost volumes of +-4 from the coarsest level to level 2, a context
-network at level 2. The coarsest level is a choice: 6 as published, or 4, which still reaches 64 px and is what a network
-trained on small crops should have, since there levels 5 and 6 are a handful of cells. Three things differ, each because it lets a short training get somewhere:
+Pyramid, warping and cost volume of +-4 from coarse to fine as in Sun et al. 2018. It is made for few minutes of training, so
+that four things differ:
 
-* every level's features are normalised per frame (channel by channel, then pixel by pixel), so that the cost volume
-  says something from the first step on;
+* the frame's features are those of RAFT-small's encoder (Teed and Deng 2020), whose published weights it may start from: an
+  eighth of the image is what is matched, averaged to a 16th and a 32nd, and a quarter is projected from the layer before;
+* one decoder serves levels 5, 4 and 3, the last of them twice (Hur and Roth 2019), so that every step of training teaches it
+  four times; level 2 has a narrow one of its own, which looks +-2 around;
 * a level's flow is the coarser flow, doubled, plus a residual, in pixels of that level;
 * the residual holds the soft arg-max of the cost volume, weighed by a gate: so the end-point loss reaches the features
   directly, not only through an untrained decoder.
 
-A small head predicts the expected end-point error from the level-2 decoder features, which it may not disturb.
+Small heads predict the expected end-point error, which may not disturb the rest. `quality` "fast" ends at level 3.
 """
 
 import torch
 import torch.nn.functional as F
 from torch import nn
 
-CHANNELS = (3, 16, 32, 64, 96, 128, 196)
+from raft import FEATURES, Encoder
+
+COARSEST, FINEST_SHARED = 5, 3
+# How often the shared decoder looks at each level.
+LOOKS = {5: 1, 4: 1, 3: 2}
+QUARTER, CONTEXT_CHANNELS = 32, 64
 DECODER_CHANNELS = (128, 128, 96, 64, 32)
-CONTEXT = ((128, 1), (128, 2), (128, 4), (96, 8), (64, 16), (32, 1))
-REACH = 4
-SIDE = 2 * REACH + 1
+NARROW_CHANNELS = (64, 64, 32)
+CONTEXT = ((64, 1), (64, 2), (64, 4), (64, 8), (32, 1))
+REACH, NARROW_REACH = 4, 2
 # Columns a tile of the cost volume has; inputs are multiples of 64 wide, so these divide the levels' widths.
 TILES = {2: 16, 3: 8}
-IMAGE_MEAN = 0.4
-LEVEL_WEIGHTS = {6: 0.25, 5: 0.25, 4: 0.4, 3: 0.5, 2: 1.0}
+LEVEL_WEIGHTS = (0.2, 0.3, 0.4, 0.6, 1.0)
+# The encoder's cell i of level n looks at pixel 2^n i; with the frame moved by so many pixels, at 2^n i + SHIFT.
+SHIFT = 2
 
 
-def conv(inputs: int, outputs: int, stride: int = 1, dilation: int = 1) -> nn.Sequential:
-    """A 3x3 convolution and a leaky ReLU of 0.1."""
+def conv(inputs: int, outputs: int, dilation: int = 1, size: int = 3) -> nn.Sequential:
+    """A convolution and a leaky ReLU of 0.1."""
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, stride, padding=dilation, dilation=dilation),
+        nn.Conv2d(inputs, outputs, size, padding=dilation * (size // 2), dilation=dilation),
         nn.LeakyReLU(0.1, inplace=True),
     )
 
 
-def levels_from(coarsest: int) -> range:
-    """Levels in the order of decoding, such as 6, 5, 4, 3, 2."""
-    return range(coarsest, 1, -1)
-
-
-def cost_volume_plain(older: torch.Tensor, newer: torch.Tensor) -> torch.Tensor:
-    """Mean product of the features at every displacement of +-4: [B, 81, H, W], dy slow, dx fast. The definition."""
+def cost_volume_plain(older: torch.Tensor, newer: torch.Tensor, reach: int = REACH) -> torch.Tensor:
+    """Mean product of the features at every displacement of +-reach: [B, side^2, H, W], dy slow, dx fast. The definition."""
     height, width = older.shape[-2:]
-    padded = F.pad(newer, [REACH] * 4)
+    padded, side = F.pad(newer, [reach] * 4), 2 * reach + 1
     products = [
         (older * padded[:, :, dy : dy + height, dx : dx + width]).mean(1, keepdim=True)
-        for dy in range(SIDE)
-        for dx in range(SIDE)
+        for dy in range(side)
+        for dx in range(side)
     ]
     return torch.cat(products, 1)
 
 
-def cost_volume(older: torch.Tensor, newer: torch.Tensor, tile: int | None) -> torch.Tensor:
+def cost_volume(older: torch.Tensor, newer: torch.Tensor, tile: int | None, reach: int = REACH) -> torch.Tensor:
     """The same in a dozen operations, for training and for the exported graph alike.
 
-    Rows are cut into tiles of `tile` >= 8 columns (None: one tile, the whole row). Each tile is multiplied, as a
-    matrix, with the nine rows around it and a halo of four columns; of the tile x (tile + 8) products the band of nine
-    diagonals is wanted. Padding the flattened matrix by `tile` and folding it one column wider turns the diagonals
-    into columns.
+    Rows are cut into tiles of `tile` >= 2 reach columns (None: one tile, the whole row). Each tile is multiplied, as a
+    matrix, with the rows around it and a halo of `reach` columns; of the tile x (tile + 2 reach) products the band of
+    2 reach + 1 diagonals is wanted. Padding the flattened matrix by `tile` and folding it one column wider turns the
+    diagonals into columns.
     """
     batch, channels, height, width = older.shape
-    halo = 2 * REACH
+    halo = 2 * reach
+    side = halo + 1
     span = width if tile is None else tile
-    rows = F.pad(newer, [REACH, REACH if tile is None else tile - REACH, REACH, REACH]).permute(0, 2, 3, 1)
+    rows = F.pad(newer, [reach, reach if tile is None else tile - reach, reach, reach]).permute(0, 2, 3, 1)
     if tile is None:
         rows = rows.unsqueeze(2)
     else:
         chunks = rows.reshape(batch, height + halo, -1, tile, channels)
         rows = torch.cat([chunks[:, :, :-1], chunks[:, :, 1:, :halo]], 3)
-    around = torch.stack([rows[:, dy : dy + height] for dy in range(SIDE)], 1)
+    around = torch.stack([rows[:, dy : dy + height] for dy in range(side)], 1)
     tiles = (older * (1.0 / channels)).permute(0, 2, 3, 1).reshape(batch, 1, height, -1, span, channels)
     products = torch.matmul(tiles, around.transpose(-1, -2))
-    band = F.pad(products.flatten(-2), [0, span]).reshape(batch, SIDE, height, -1, span, span + halo + 1)[..., :SIDE]
-    return band.permute(0, 1, 5, 2, 3, 4).reshape(batch, SIDE * SIDE, height, width)
+    band = F.pad(products.flatten(-2), [0, span]).reshape(batch, side, height, -1, span, span + halo + 1)[..., :side]
+    return band.permute(0, 1, 5, 2, 3, 4).reshape(batch, side * side, height, width)
 
 
 def warp(features: torch.Tensor, flow: torch.Tensor) -> torch.Tensor:
@@ -97,85 +100,110 @@ def normalised(features: torch.Tensor) -> torch.Tensor:
     return (scaled * torch.rsqrt(scaled.square().mean(1, keepdim=True) + 0.05)).to(features.dtype)
 
 
-class Pyramid(nn.Module):
-    """Image [B, 3, H, W] (linear RGB, mean about 0.4) to normalised features of level 2 to the coarsest."""
+def halved(values: torch.Tensor) -> torch.Tensor:
+    """Means of 2x2 cells."""
+    return F.avg_pool2d(values, 2)
 
-    def __init__(self, coarsest: int):
+
+def twice(values: torch.Tensor) -> torch.Tensor:
+    """[B, C, h, w] of level 3, whose cell i looks at pixel 8 i + SHIFT, for level 2, whose cell j looks at 4 j + SHIFT:
+    every second cell is a coarser one, and those between are the mean of their neighbours."""
+    for dim in (2, 3):
+        following = torch.cat([values.narrow(dim, 1, values.shape[dim] - 1), values.narrow(dim, values.shape[dim] - 1, 1)], dim)
+        values = torch.stack([values, 0.5 * (values + following)], dim + 1).flatten(dim, dim + 1)
+    return values
+
+
+class Pyramid(nn.Module):
+    """Image [B, 3, H, W] (linear RGB, mean about 0.4) to what is to be known of one frame: features to match at level 2
+    [B, 32, H/4, W/4] and 3 [B, 128, H/8, W/8], and context at level 3 [B, 64, H/8, W/8]."""
+
+    def __init__(self):
         super().__init__()
-        channels = CHANNELS[: coarsest + 1]
-        self.levels = nn.ModuleList(
-            nn.Sequential(conv(i, o, stride=2), conv(o, o), conv(o, o)) for i, o in zip(channels, channels[1:])
-        )
+        self.encoder = Encoder(FEATURES, normed=True)
+        self.quarter = nn.Conv2d(64, QUARTER, 1)
+        self.context = conv(FEATURES, CONTEXT_CHANNELS, size=1)
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        features, x = [], image - IMAGE_MEAN
-        for level in self.levels:
-            x = level(x)
-            features.append(x)
-        return tuple(normalised(f) for f in features[1:])
+        quarter, eighth = self.encoder.levels(F.pad(2 * image - 1, [-SHIFT, SHIFT] * 2))
+        return normalised(self.quarter(quarter)), normalised(eighth), self.context(eighth)
 
 
 class LevelDecoder(nn.Module):
-    """One level: cost volume, five convolutions, a residual flow in pixels of this level."""
+    """Cost volume, convolutions, a residual flow in pixels of this level."""
 
-    def __init__(self, level: int, coarsest: int):
+    def __init__(self, reach: int, context: int, above: int, widths: tuple[int, ...]):
         super().__init__()
-        self.tile = TILES.get(level)
-        above = 0 if level == coarsest else 2 + 2
-        widths = (SIDE * SIDE + 2 + CHANNELS[level] + above, *DECODER_CHANNELS)
+        side = 2 * reach + 1
+        self.reach = reach
+        widths = (side * side + 2 + context + 2 + above, *widths)
         self.body = nn.Sequential(*(conv(i, o) for i, o in zip(widths, widths[1:])))
         self.predict = nn.Conv2d(widths[-1], 3, 3, padding=1)
-        self.up_features = nn.ConvTranspose2d(widths[-1], 2, 4, 2, 1) if level > 2 else None
         self.sharpness = nn.Parameter(torch.tensor(3.0))
-        offsets = torch.arange(-REACH, REACH + 1, dtype=torch.float32)
+        offsets = torch.arange(-reach, reach + 1, dtype=torch.float32)
         dy, dx = torch.meshgrid(offsets, offsets, indexing="ij")
-        self.register_buffer("offsets", torch.stack([dx.flatten(), dy.flatten()])[:, :, None, None], persistent=False)
+        self.register_buffer("offsets", torch.stack([dx.flatten(), dy.flatten()]), persistent=False)
 
-    def forward(self, older, newer, above):
-        """Flow [B, 2, H, W] and body features; `above` is None or (flow, features) already at this level's size."""
-        fetched = newer if above is None else warp(newer.float(), above[0]).to(newer.dtype)
-        volume = cost_volume(older, fetched, self.tile)
+    def forward(self, older, newer, context, flow, above, tile, fetch=True):
+        """Flow [B, 2, H, W] and body features, from those of the level above at this level's size."""
+        fetched = warp(newer.float(), flow).to(newer.dtype) if fetch else newer
+        volume = cost_volume(older, fetched, tile, self.reach)
         pooled = F.avg_pool2d(volume.float(), 3, 1, 1, count_include_pad=False)
         weights = torch.softmax(pooled * self.sharpness.exp(), 1)
-        argmax = F.conv2d(weights, self.offsets)
-        parts = [F.leaky_relu(volume, 0.1), argmax.to(volume.dtype), older]
-        if above is not None:
-            parts += [above[0].to(volume.dtype), above[1]]
+        argmax = torch.einsum("bdyx,cd->bcyx", weights, self.offsets)
+        # Flow is of the size of a cost volume's reach, and larger at large motion only.
+        parts = [volume * 4, argmax.to(volume.dtype), context, (0.25 * flow).to(volume.dtype), above]
         features = self.body(torch.cat(parts, 1))
         residual = self.predict(features).float()
-        flow = residual[:, :2] + torch.sigmoid(residual[:, 2:]) * argmax
-        return (flow if above is None else flow + above[0]), features
+        return flow + residual[:, :2] + torch.sigmoid(residual[:, 2:]) * argmax, features
+
+
+def error_head() -> nn.Sequential:
+    """Body features to what softplus makes an expected error of."""
+    return nn.Sequential(conv(DECODER_CHANNELS[-1], 32), nn.Conv2d(32, 1, 3, padding=1))
 
 
 class Decoder(nn.Module):
     """Two frames' features to the flow from the older to the newer frame, and its expected error.
 
-    Returns the flows from the coarsest level to level 2, each in pixels of its level, and the expected end-point error [B, 1, H/4, W/4] in
-    pixels of the network's input.
+    Returns the flows from the coarsest level on, each in pixels of its level, and the expected end-point error
+    [B, 1, H/4, W/4] in pixels of the network's input. The last flow is at level 2, also of the fast one. In training
+    the expected errors are a list, of the last two flows at their own levels.
     """
 
-    def __init__(self, coarsest: int):
+    def __init__(self):
         super().__init__()
-        self.coarsest = coarsest
-        self.levels = nn.ModuleList(LevelDecoder(level, coarsest) for level in levels_from(coarsest))
-        widths = (DECODER_CHANNELS[-1], *(c for c, _ in CONTEXT))
+        self.shared = LevelDecoder(REACH, CONTEXT_CHANNELS, DECODER_CHANNELS[-1], DECODER_CHANNELS)
+        widths = (DECODER_CHANNELS[-1] + 2, *(c for c, _ in CONTEXT))
         self.context = nn.Sequential(
             *(conv(i, o, dilation=d) for i, (o, d) in zip(widths, CONTEXT)), nn.Conv2d(widths[-1], 2, 3, padding=1)
         )
-        self.error = nn.Sequential(conv(DECODER_CHANNELS[-1], 32), nn.Conv2d(32, 1, 3, padding=1))
+        self.fine = LevelDecoder(NARROW_REACH, QUARTER, DECODER_CHANNELS[-1], NARROW_CHANNELS)
+        self.error, self.fast_error = error_head(), error_head()
 
-    def forward(self, older, newer):
-        flows, above = [], None
-        for level, decoder in zip(levels_from(self.coarsest), self.levels):
-            flow, features = decoder(older[level - 2], newer[level - 2], above)
-            if level > 2:
-                up = 2.0 * F.interpolate(flow, scale_factor=2, mode="bilinear", align_corners=False)
-                above = (up, decoder.up_features(features))
-            else:
-                flow = flow + self.context(features).float()
-            flows.append(flow)
+    def forward(self, older, newer, fast: bool = False):
+        matched = {3: (older[1], newer[1], older[2])}
+        for level in range(FINEST_SHARED + 1, COARSEST + 1):
+            matched[level] = tuple(halved(m) for m in matched[level - 1])
+        coarse = matched[COARSEST][0]
+        flow, above = torch.zeros_like(coarse[:, :2]).float(), torch.zeros_like(coarse[:, : DECODER_CHANNELS[-1]])
+        flows = []
+        for level, looks in LOOKS.items():
+            if level < COARSEST:
+                flow = 2.0 * F.interpolate(flow, scale_factor=2, mode="bilinear", align_corners=False)
+                above = F.interpolate(above, scale_factor=2, mode="bilinear", align_corners=False)
+            for _ in range(looks):
+                fetch = len(flows) > 0
+                flow, above = self.shared(*matched[level], flow, above, TILES.get(level), fetch)
+                flows.append(flow)
+        flows[-1] = flow = flow + self.context(torch.cat([above, (0.25 * flow).to(above.dtype)], 1)).float()
+        flow = 2.0 * twice(flow)
+        coarser = F.softplus(self.fast_error(above.detach()).float()) + 0.01 if fast or self.training else None
+        if fast:
+            return [*flows, flow], twice(coarser)
+        flow, features = self.fine(older[0], newer[0], older[0], flow, twice(above), TILES[2])
         expected = F.softplus(self.error(features.detach()).float()) + 0.01
-        return flows, expected
+        return [*flows, flow], [coarser, expected] if self.training else expected
 
 
 class PwcNet(nn.Module):
@@ -183,28 +211,46 @@ class PwcNet(nn.Module):
 
     # Scalars that have a long way to go.
     FAST = ("sharpness",)
+    # Published weights, which need no more than a touch.
+    SLOW = ("pyramid.encoder.",)
 
-    def __init__(self, coarsest: int = 6):
+    def __init__(self, fast: bool = False):
         super().__init__()
-        self.pyramid, self.decoder = Pyramid(coarsest), Decoder(coarsest)
-        for module in self.modules():
-            if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
-                nn.init.kaiming_normal_(module.weight, a=0.1)
-                nn.init.zeros_(module.bias)
+        self.fast = fast
+        self.pyramid, self.decoder = Pyramid(), Decoder()
+        for module in (self.pyramid.quarter, self.pyramid.context, self.decoder):
+            for part in module.modules():
+                if isinstance(part, nn.Conv2d):
+                    nn.init.kaiming_normal_(part.weight, a=0.1)
+                    nn.init.zeros_(part.bias)
+        decoder = self.decoder
         with torch.no_grad():  # The residuals begin small, so that the soft arg-max leads.
-            for last in [*(d.predict for d in self.decoder.levels), self.decoder.context[-1], self.decoder.error[-1]]:
+            for last in (decoder.shared.predict, decoder.fine.predict, decoder.context[-1], decoder.error[-1], decoder.fast_error[-1]):
                 last.weight.mul_(0.1)
-            for decoder in self.decoder.levels:
-                decoder.predict.bias[2] = -1.5
+            for level in (decoder.shared, decoder.fine):
+                level.predict.bias[2] = -1.5
+
+    def published(self, path) -> None:
+        """Takes the encoder's published weights; every one of them must fit."""
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        encoder = {n.removeprefix("module.fnet."): v for n, v in state.items() if n.startswith("module.fnet.")}
+        self.pyramid.encoder.load_state_dict(encoder)
 
     @staticmethod
     def weighed(flows: list[torch.Tensor]) -> list[tuple[torch.Tensor, float]]:
         """Flows in pixels of the image, from the coarsest level to level 2, with their weights in the loss."""
-        levels = levels_from(len(flows) + 1)
-        return [(flow * 2**level, LEVEL_WEIGHTS[level]) for level, flow in zip(levels, flows)]
+        levels = [level for level, looks in LOOKS.items() for _ in range(looks)] + [2]
+        return [(flow * 2**level, weight) for level, flow, weight in zip(levels, flows, LEVEL_WEIGHTS)]
+
+    @staticmethod
+    def truth(flow: torch.Tensor, cell: int) -> torch.Tensor:
+        """The true flow [B, 2, H, W] where cells of so many pixels look: around pixel cell * i + SHIFT, at level 2 its mean
+        over the cell, which is what the node's raster says."""
+        before = SHIFT if cell >= 2**FINEST_SHARED else 0
+        return F.avg_pool2d(F.pad(flow, [before, 0, before, 0], mode="replicate"), cell)
 
     def forward(self, older: torch.Tensor, newer: torch.Tensor):
         """One shared pyramid call for both frames, then the decoder."""
         half = older.shape[0]
         features = self.pyramid(torch.cat([older, newer]))
-        return self.decoder([f[:half] for f in features], [f[half:] for f in features])
+        return self.decoder([f[:half] for f in features], [f[half:] for f in features], self.fast)

@@ -53,10 +53,15 @@ class Encoder(nn.Module):
         self.conv2 = nn.Conv2d(96, leaving, 1)
         self.normed = normed
 
-    def forward(self, image: Tensor) -> Tensor:
+    def levels(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """A quarter [B, 64, H/4, W/4], and an eighth of `leaving` channels."""
         x = self.conv1(image)
         x = F.relu(F.instance_norm(x) if self.normed else x)
-        return self.conv2(self.layer3(self.layer2(self.layer1(x))))
+        quarter = self.layer2(self.layer1(x))
+        return quarter, self.conv2(self.layer3(quarter))
+
+    def forward(self, image: Tensor) -> Tensor:
+        return self.levels(image)[1]
 
 
 class Motion(nn.Module):
@@ -137,6 +142,7 @@ class RaftSmall(nn.Module):
 
     # New parts, which have all to learn.
     FAST = ("enlarge.", "error.")
+    SLOW = ()
 
     def published(self, path) -> None:
         """Takes the published weights; every one of them must fit, and only the two new heads stay as they are."""
@@ -149,6 +155,11 @@ class RaftSmall(nn.Module):
     def weighed(flows: list[Tensor]) -> list[tuple[Tensor, float]]:
         """Flows in pixels of the image with their weights in the loss: later iterations count more."""
         return [(flow, 0.8 ** (len(flows) - 1 - i)) for i, flow in enumerate(flows)]
+
+    @staticmethod
+    def truth(flow: Tensor, cell: int) -> Tensor:
+        """The true flow's mean over cells of so many pixels."""
+        return F.avg_pool2d(flow, cell)
 
     def frame(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """What is to be known of one frame: features to match [B, 128, h, w], and state and context [B, 160, h, w]."""

@@ -26,24 +26,26 @@ JUDGED_LEVELS = (0, 10, 20, 30, 60)
 
 def network_of(description: dict) -> nn.Module:
     """The network that a run's TOML describes, untrained but for published weights that it starts from."""
-    kind = description.get("network", "pwcnet")
+    kind = description["network"]
     if kind == "pwcnet":
-        return PwcNet(description["coarsest"])
+        return PwcNet()
     if kind == "raftsmall":
         return RaftSmall(description["iterations"])
     raise ValueError(f"expected the network pwcnet or raftsmall, found {kind}")
 
 
-def loss_of(weighed, expected, truth):
-    """Weighed sum of end-point errors in pixels of the input, and the likelihood of the error head (exponential law)
-    for the last flow. `weighed` has flows [B, 2, H/n, W/n] in pixels with their weights."""
-    total = 0.0
-    for flow, weight in weighed:
-        cell = truth.shape[-1] // flow.shape[-1]
-        error = (flow - F.avg_pool2d(truth, cell)).square().sum(1, keepdim=True).add(1e-6).sqrt()
-        total = total + weight * error.mean()
-    error = error.detach()
-    return total, (torch.log(expected) + error / expected).mean(), error.mean()
+def loss_of(network, flows, expected, truth):
+    """Weighed sum of end-point errors in pixels of the input, the likelihood of the error heads (exponential law), and the
+    last flow's error. `expected` is of the last flow, or a list of the last few."""
+    total, errors = 0.0, []
+    for flow, weight in network.weighed(flows):
+        wanted = network.truth(truth, truth.shape[-1] // flow.shape[-1])
+        errors.append((flow - wanted).square().sum(1, keepdim=True).add(1e-6).sqrt())
+        total = total + weight * errors[-1].mean()
+    heads = expected if isinstance(expected, list) else [expected]
+    pairs = list(zip(heads, (error.detach() for error in errors[-len(heads) :])))
+    likelihood = sum((torch.log(head) + error / head).mean() for head, error in pairs)
+    return total, likelihood, errors[-1].detach().mean()
 
 
 def average_gradients(network: nn.Module) -> None:
@@ -78,15 +80,19 @@ class Run:
             if "start" in description:
                 network.published(description["start"])
         self.device = torch.get_default_device()
-        self.network = network.to(self.device, memory_format=torch.channels_last)
+        # On a CPU instance norms would copy every map into the other layout and back: twice the encoder's time.
+        self.layout = torch.channels_last if self.device.type == "cuda" else torch.contiguous_format
+        self.network = network.to(self.device, memory_format=self.layout)
         self.mean = copy.deepcopy(self.network).requires_grad_(False)
-        fast, rest = [], []
+        fast, slow, rest = [], [], []
         for name, parameter in self.network.named_parameters():
-            (fast if any(part in name for part in network.FAST) else rest).append(parameter)
+            of = lambda parts: any(part in name for part in parts)
+            (fast if of(network.FAST) else slow if of(network.SLOW) else rest).append(parameter)
         self.optimizer = torch.optim.AdamW(
             [
                 {"params": rest, "factor": 1.0, "weight_decay": description["weight_decay"]},
                 {"params": fast, "factor": 10.0, "weight_decay": 0.0},
+                {"params": slow, "factor": 0.3, "weight_decay": description["weight_decay"]},
             ],
             fused=True,
         )
@@ -125,10 +131,10 @@ class Run:
         makes the CPU wait for the GPU."""
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate() * group["factor"]
-        older, newer = (f.contiguous(memory_format=torch.channels_last) for f in (older, newer))
+        older, newer = (f.contiguous(memory_format=self.layout) for f in (older, newer))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.description["bf16"]):
             flows, expected = self.forward(older, newer)
-        loss, likelihood, error = loss_of(self.network.weighed(flows), expected, truth)
+        loss, likelihood, error = loss_of(self.network, flows, expected, truth)
         self.optimizer.zero_grad(set_to_none=True)
         (loss + 0.1 * likelihood).backward()
         average_gradients(self.network)
@@ -158,8 +164,7 @@ class Run:
             "mean": self.mean.state_dict(),
             "moments": {i: {n: narrow(n, v) for n, v in m.items()} for i, m in optimizer["state"].items()},
             "random": torch.get_rng_state(),
-            "kind": self.description.get("network", "pwcnet"),
-            "coarsest": self.description.get("coarsest"),
+            "kind": self.description["network"],
             "step": self.step,
             "seconds": self.seconds,
         }
@@ -170,12 +175,8 @@ class Run:
     def load(self, folder: Path) -> None:
         """Goes on where `save` left off; the random numbers too, unless the leg before ran on another kind of machine."""
         state = checkpoints.load(folder)
-        wanted, found = self.description, (state["kind"], state["coarsest"])
-        if found != (wanted.get("network", "pwcnet"), wanted.get("coarsest")):
-            raise ValueError(
-                f"{folder}: expected a {wanted.get('network', 'pwcnet')} from level {wanted.get('coarsest')}, found a "
-                f"{found[0]} from level {found[1]}"
-            )
+        if state["kind"] != self.description["network"]:
+            raise ValueError(f"{folder}: expected a {self.description['network']}, found a {state['kind']}")
         self.network.load_state_dict(state["network"])
         self.mean.load_state_dict(state["mean"])
         optimizer = self.optimizer.state_dict()

@@ -3,16 +3,17 @@
 import pytest
 import torch
 
-from networks import PwcNet, levels_from, cost_volume, cost_volume_plain
+from networks import LOOKS, SHIFT, PwcNet, cost_volume, cost_volume_plain, halved, twice
 
 
 @pytest.mark.parametrize(
-    "shape, tile", [((2, 32, 8, 48), 16), ((2, 8, 6, 24), 8), ((1, 5, 8, 12), None), ((1, 5, 2, 3), None)]
+    "shape, tile, reach",
+    [((2, 32, 8, 48), 16, 4), ((2, 8, 6, 24), 8, 4), ((1, 5, 8, 12), None, 4), ((1, 5, 2, 3), None, 4), ((2, 6, 5, 32), 16, 2)],
 )
-def test_fast_cost_volume_equals_the_plain_one(shape, tile):
+def test_fast_cost_volume_equals_the_plain_one(shape, tile, reach):
     torch.manual_seed(0)
     older, newer = (torch.randn(shape, dtype=torch.double, requires_grad=True) for _ in range(2))
-    plain, fast = cost_volume_plain(older, newer), cost_volume(older, newer, tile)
+    plain, fast = cost_volume_plain(older, newer, reach), cost_volume(older, newer, tile, reach)
     torch.testing.assert_close(fast, plain, rtol=0, atol=1e-12)
     weight = torch.randn_like(plain)
     wanted = torch.autograd.grad((plain * weight).sum(), (older, newer))
@@ -29,24 +30,43 @@ def test_cost_volume_peaks_at_the_displacement():
     assert (best == (2 + 4) * 9 + (-3 + 4)).all()
 
 
-@pytest.mark.parametrize("coarsest", [4, 6])
-def test_shapes_and_every_parameter_learns(coarsest):
+def biased(name: str) -> bool:
+    """Biases that an instance norm takes away."""
+    return name.startswith("pyramid.encoder") and name.endswith("bias") or name == "pyramid.quarter.bias"
+
+
+def test_shapes_and_every_parameter_learns():
     torch.manual_seed(0)
-    network = PwcNet(coarsest)
+    network = PwcNet()
     flows, expected = network(torch.rand(2, 3, 64, 128), torch.rand(2, 3, 64, 128))
-    assert [tuple(f.shape) for f in flows] == [(2, 2, 64 >> level, 128 >> level) for level in levels_from(coarsest)]
-    assert expected.shape == (2, 1, 16, 32) and (expected > 0).all()
-    (sum(f.square().sum() for f in flows) + expected.sum()).backward()
+    levels = [level for level, looks in LOOKS.items() for _ in range(looks)] + [2]
+    assert [tuple(f.shape) for f in flows] == [(2, 2, 64 >> level, 128 >> level) for level in levels]
+    assert [tuple(e.shape) for e in expected] == [(2, 1, 8, 16), (2, 1, 16, 32)] and all((e > 0).all() for e in expected)
+    (sum(f.square().sum() for f in flows) + sum(e.sum() for e in expected)).backward()
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None and parameter.grad.isfinite().all(), name
-        assert parameter.grad.abs().sum() > 0, name
+        assert biased(name) or parameter.grad.abs().sum() > 0, name
 
 
-def test_the_error_head_leaves_the_trunk_alone():
-    network = PwcNet()
+@pytest.mark.parametrize("fast", [False, True])
+def test_the_error_heads_leave_the_trunk_alone(fast):
+    network = PwcNet(fast).eval()
     network(torch.rand(1, 3, 64, 64), torch.rand(1, 3, 64, 64))[1].sum().backward()
     touched = {name for name, p in network.named_parameters() if p.grad is not None}
-    assert touched and all(name.startswith("decoder.error.") for name in touched)
+    assert touched and all(name.startswith("decoder.fast_error." if fast else "decoder.error.") for name in touched)
+
+
+def test_the_fast_network_is_the_same_up_to_level_3():
+    torch.manual_seed(0)
+    network, frames = PwcNet().eval(), torch.rand(2, 3, 64, 128)
+    with torch.no_grad():
+        full, _ = network(frames[:1], frames[1:])
+        network.fast = True
+        fast, expected = network(frames[:1], frames[1:])
+    assert len(fast) == len(full) and expected.shape == (1, 1, 16, 32)
+    for a, b in zip(fast[:-1], full[:-1]):
+        assert torch.equal(a, b)
+    assert torch.equal(fast[-1], 2 * twice(fast[-2]))
 
 
 def test_features_of_a_frame_do_not_depend_on_its_partner():
@@ -55,3 +75,32 @@ def test_features_of_a_frame_do_not_depend_on_its_partner():
     with torch.no_grad():
         for together, alone in zip(network.pyramid(frames), network.pyramid(frames[:1])):
             torch.testing.assert_close(together[:1], alone, rtol=1e-4, atol=1e-5)
+
+
+def test_cells_look_where_their_truth_is():
+    """An evenly growing picture: every level's truth is its value where the level's cells look, and what is brought from
+    one level to the next lies where the next one's cells look."""
+    ramp = torch.arange(128.0).expand(1, 2, 64, 128)
+    inner = (..., slice(1, -1))
+    for level in (3, 4, 5):
+        middle = SHIFT + 2 ** (level - 1) - 4 + 2**level * torch.arange(128 >> level)
+        truth = PwcNet.truth(ramp, 2**level)
+        assert truth.shape == (1, 2, 64 >> level, 128 >> level)
+        # A window of an even number of pixels lies half a pixel beside.
+        torch.testing.assert_close(truth[inner], (middle - 0.5).expand_as(truth)[inner])
+    eighth = (SHIFT + 8 * torch.arange(16.0)).expand(1, 2, 8, 16)
+    assert torch.equal(halved(eighth)[0, 0, 0], SHIFT + 4 + 16 * torch.arange(8.0))
+    assert torch.equal(twice(eighth)[0, 0, 0, :-1], SHIFT + 4 * torch.arange(31.0))
+    assert torch.equal(PwcNet.truth(ramp, 4)[0, 0, 0], 1.5 + 4 * torch.arange(32.0))
+
+
+def test_published_weights_fit_or_are_refused(tmp_path):
+    network = PwcNet()
+    state = {f"module.fnet.{n}": v + 1 for n, v in network.pyramid.encoder.state_dict().items()}
+    torch.save(state | {"module.cnet.other": torch.zeros(1)}, tmp_path / "fits.pth")
+    network.published(tmp_path / "fits.pth")
+    assert torch.equal(network.pyramid.encoder.conv1.weight, state["module.fnet.conv1.weight"])
+    del state["module.fnet.conv1.weight"]
+    torch.save(state, tmp_path / "lacks.pth")
+    with pytest.raises(RuntimeError, match="conv1.weight"):
+        network.published(tmp_path / "lacks.pth")
