@@ -1,4 +1,4 @@
-//! Logarithm, power and the normal curve by plain arithmetic, the same bits on every machine.
+//! Logarithm, power, sine and the normal curve by plain arithmetic, the same bits on every machine.
 //!
 //! The platform's mathematical library rounds its last bit as it likes; what is drawn from a seed must not show it.
 
@@ -28,6 +28,16 @@ pub(super) fn exp(x: f64) -> f64 {
 /// xʸ of x ≥ 0 and y > 0.
 pub(super) fn power(x: f64, y: f64) -> f64 {
     if x > 0.0 { exp(y * ln(x)) } else { 0.0 }
+}
+
+/// The sine of so many turns, right to 1e-15 for a few of them.
+pub(super) fn sine(turns: f64) -> f64 {
+    let part = turns - turns.round();
+    // Beyond a quarter it comes back.
+    let folded = if part.abs() > 0.25 { 0.5f64.copysign(part) - part } else { part };
+    let x = folded * std::f64::consts::TAU;
+    let series = (1..=10).rev().fold(1.0, |sum, k| 1.0 - sum * x * x / f64::from(2 * k * (2 * k + 1)));
+    x * series
 }
 
 /// The density of N(0, 1), and the part of it below t (Abramowitz and Stegun 26.2.17, right to 1e-7).
@@ -68,6 +78,7 @@ mod tests {
             let y = x - 14.0;
             assert!((exp(y) / y.exp() - 1.0).abs() < 4e-15, "exp {y}");
             let z = f64::from(i) / 2000.0;
+            assert!((sine(y) - (std::f64::consts::TAU * y).sin()).abs() < 2e-14, "sine {y}");
             assert!((power(z, 2.2) / z.powf(2.2) - 1.0).abs() < 1e-14, "{z} to the 2.2");
         }
         assert_eq!([power(0.0, 2.2), power(1.0, 2.2), exp(0.0), ln(1.0)], [0.0, 1.0, 1.0, 0.0]);

@@ -14,11 +14,14 @@
 //! mosaic would add the demosaicing's errors to the flow's.
 //!
 //! After the scaling a gain r has made of the noise a' = r·a and b' = r²·b on values around 0.4.
+//!
+//! A camera may have a fault besides ([`faults`](super::faults)): it comes between steps 3 and 4.
 
 use rayon::prelude::*;
 use xxhash_rust::xxh3::xxh3_64_with_seed;
 
 use super::{
+    faults::{Fault, Pattern},
     noise::{Noise, Normals},
     picture::Picture,
     profiles,
@@ -46,6 +49,8 @@ pub struct Sensor {
     pub black: f64,
     /// Counts of a full pixel.
     pub white: f64,
+    /// What it does to pictures besides.
+    pub fault: Fault,
 }
 
 impl Sensor {
@@ -54,7 +59,8 @@ impl Sensor {
         let noise = profiles::find(camera, iso)?;
         let name = camera.trim().to_lowercase();
         let maker = BLACKS.iter().find(|(maker, _)| name.starts_with(maker));
-        Ok(Self { noise, black: maker.map_or(BLACK_OF_OTHERS, |(_, black)| *black), white: WHITE })
+        let black = maker.map_or(BLACK_OF_OTHERS, |(_, black)| *black);
+        Ok(Self { noise, black, white: WHITE, fault: Fault::None })
     }
 }
 
@@ -97,8 +103,14 @@ impl Linear {
     /// number of threads; another name draws other noise.
     pub fn expose(&self, sensor: &Sensor, raw_mean: f64, seed: u64, name: &str) -> Rung {
         let factor = raw_mean / self.mean.max(f64::MIN_POSITIVE);
+        // Of every exposure the same: two of them differ by their light.
+        let fault_seed = xxh3_64_with_seed(name.as_bytes(), seed);
         let seed = xxh3_64_with_seed(name.as_bytes(), seed ^ raw_mean.to_bits());
-        let counts = [0, 1].map(|frame| self.photograph(frame, factor, sensor, seed));
+        let white = sensor.noise.variance(1, raw_mean).sqrt();
+        let counts = [0, 1].map(|frame| {
+            let pattern = sensor.fault.pattern([self.width, self.height], frame, white, &sensor.noise, fault_seed);
+            self.photograph(frame, factor, sensor, &pattern, seed)
+        });
         let span = sensor.white - sensor.black;
         let sum: f64 = counts.iter().flatten().map(|count| f64::from(*count) - sensor.black).sum();
         let measured = sum / span / counts.iter().map(Vec::len).sum::<usize>().max(1) as f64;
@@ -112,20 +124,21 @@ impl Linear {
             clean,
             gain,
             noise: Noise { a: sensor.noise.a.map(|a| a * gain), b: sensor.noise.b.map(|b| b * gain * gain) },
-            step: gain / span,
+            step: sensor.fault.step() * gain / span,
         }
     }
 
-    fn photograph(&self, frame: usize, factor: f64, sensor: &Sensor, seed: u64) -> Vec<u16> {
+    fn photograph(&self, frame: usize, factor: f64, sensor: &Sensor, pattern: &Pattern, seed: u64) -> Vec<u16> {
         let mut counts = vec![0; self.frames[frame].len()];
-        let span = sensor.white - sensor.black;
+        let (span, noise) = (sensor.white - sensor.black, sensor.fault.kept(&sensor.noise));
         let rows = counts.par_chunks_exact_mut(3 * self.width).zip(self.frames[frame].par_chunks_exact(3 * self.width));
         rows.enumerate().for_each(|(row, (counts, lights))| {
-            let mut draws = Normals::new(seed, (frame as u64) << 32 | row as u64);
-            for (at, (count, light)) in counts.iter_mut().zip(lights).enumerate() {
+            let mut draws = Normals::of_row(seed, frame, row);
+            let added = pattern.row(row, self.width);
+            for (at, ((count, light), added)) in counts.iter_mut().zip(lights).zip(added).enumerate() {
                 let clean = (f64::from(*light) * factor).min(1.0);
-                let raw = sensor.noise.counted(at % 3, clean, &mut draws);
-                *count = (sensor.black + span * raw).round().clamp(0.0, sensor.white) as u16;
+                let raw = noise.counted(at % 3, clean, &mut draws) + added;
+                *count = sensor.fault.quantised(sensor.black + span * raw, sensor.white);
             }
         });
         counts
@@ -145,7 +158,7 @@ pub struct Rung {
     pub clean: Vec<f32>,
     /// The gain of the scaling, r.
     pub gain: f64,
-    /// The noise after the scaling, r·a and r²·b.
+    /// The noise after the scaling, r·a and r²·b, without what a fault adds.
     pub noise: Noise,
     /// One raw count after the scaling; quantisation adds a twelfth of its square to the variance.
     pub step: f64,

@@ -7,6 +7,7 @@ mod curves;
 pub mod datasets;
 pub mod enhance;
 mod eye;
+pub mod faults;
 pub mod fcdn;
 pub mod flight;
 pub mod flow_files;

@@ -19,6 +19,11 @@ impl Normals {
         Self { draws, spare: None }
     }
 
+    /// The series of a row of a frame.
+    pub fn of_row(seed: u64, frame: usize, row: usize) -> Self {
+        Self::new(seed, (frame as u64) << 32 | row as u64)
+    }
+
     /// The next draw of N(0, 1) (Box and Muller).
     pub fn draw(&mut self) -> f64 {
         if let Some(kept) = self.spare.take() {

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use image::ImageEncoder as _;
+
 /// Rows of red, green, blue bytes.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Picture {
@@ -23,6 +25,15 @@ pub struct Error {
     pub reason: image::ImageError,
 }
 
+/// A picture that a JPEG can't hold.
+#[derive(Debug, thiserror::Error)]
+#[error("a picture of {width} × {height} does not go through a JPEG: {reason}")]
+pub struct Unpacked {
+    width: usize,
+    height: usize,
+    reason: image::ImageError,
+}
+
 impl From<image::RgbImage> for Picture {
     fn from(rgb: image::RgbImage) -> Self {
         Self { width: rgb.width() as usize, height: rgb.height() as usize, rgb: rgb.into_raw() }
@@ -35,6 +46,18 @@ impl Picture {
         let (width, height) = (self.width as u32, self.height as u32);
         image::save_buffer(path, &self.rgb, width, height, image::ColorType::Rgb8)
             .map_err(|reason| Error { path: path.into(), reason })
+    }
+
+    /// What is left of it in a JPEG of this quality (1…100, chroma at full resolution).
+    pub fn through_jpeg(&self, quality: u8) -> Result<Self, Unpacked> {
+        let mut file = vec![];
+        let encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, quality);
+        let (width, height) = (self.width as u32, self.height as u32);
+        let read = encoder
+            .write_image(&self.rgb, width, height, image::ExtendedColorType::Rgb8)
+            .and_then(|()| image::load_from_memory_with_format(&file, image::ImageFormat::Jpeg));
+        let read = read.map_err(|reason| Unpacked { width: self.width, height: self.height, reason })?;
+        Ok(read.into_rgb8().into())
     }
 
     /// Values 0…1 (255 is 1), interleaved like the bytes, to the nearest byte.
