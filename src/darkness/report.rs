@@ -8,6 +8,7 @@ use serde::Serialize;
 use super::{
     bound::Limit,
     datasets::Skipped,
+    faults::Fault,
     score::{Score, Spread},
 };
 
@@ -18,6 +19,9 @@ pub struct Record {
     pub pair: String,
     /// The exposure, the pass, or `all`.
     pub condition: String,
+    /// What noise was there besides the camera's; nothing where several kinds aren't compared.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fault: Option<Fault>,
     /// What the frames went through.
     pub enhancer: String,
     /// The method.
@@ -35,7 +39,7 @@ impl Record {
     pub fn new(pair: &str, condition: &str, enhancer: &str, model: &str, score: Score) -> Self {
         let Score { epe, fl_all, aae } = score;
         let [pair, condition, enhancer, model] = [pair, condition, enhancer, model].map(str::to_owned);
-        Self { pair, condition, enhancer, model, epe, fl_all, aae }
+        Self { pair, condition, fault: None, enhancer, model, epe, fl_all, aae }
     }
 
     fn method(&self) -> String {
@@ -50,6 +54,8 @@ pub struct Report {
     pub about: Vec<(String, String)>,
     /// Conditions in their order, and how each is shown.
     pub conditions: Vec<(String, String)>,
+    /// Kinds of noise in their order where they are compared; limits and the tables of all measures are of the first.
+    pub faults: Vec<Fault>,
     /// Scores.
     pub records: Vec<Record>,
     /// The Cramér–Rao bound: pair, condition, bound.
@@ -57,6 +63,9 @@ pub struct Report {
     /// What was left out.
     pub skipped: Vec<Skipped>,
 }
+
+/// What a figure is of: the condition, the kind of noise where they are compared, the method.
+type Cell<'a> = (&'a str, Option<Fault>, &'a str);
 
 /// A measure: its title, its value in a record, and decimals.
 type Measure = (&'static str, fn(&Record) -> f64, usize);
@@ -79,14 +88,27 @@ impl Report {
         methods
     }
 
-    fn spread(&self, condition: &str, method: &str, measure: fn(&Record) -> f64) -> Option<Spread> {
-        let here = self.records.iter().filter(|record| record.condition == condition && record.method() == method);
-        over_pairs(here.map(|record| (record.pair.as_str(), measure(record))))
+    /// What a measure says in each pair.
+    fn measured(&self, cell: Cell<'_>, measure: fn(&Record) -> f64) -> BTreeMap<&str, f64> {
+        let (condition, fault, method) = cell;
+        let here = self.records.iter().filter(|record| record.condition == condition && record.fault == fault);
+        let here = here.filter(|record| record.method() == method);
+        by_pair(here.map(|record| (record.pair.as_str(), measure(record))))
+    }
+
+    fn spread(&self, cell: Cell<'_>, measure: fn(&Record) -> f64) -> Option<Spread> {
+        Spread::of(&self.measured(cell, measure).into_values().collect::<Vec<_>>())
+    }
+
+    /// The kinds of noise, of which there is one without a name where none are compared.
+    fn kinds(&self) -> Vec<Option<Fault>> {
+        if self.faults.is_empty() { vec![None] } else { self.faults.iter().copied().map(Some).collect() }
     }
 
     fn limit(&self, condition: &str, of: fn(&Limit) -> f64) -> Option<Spread> {
         let here = self.limits.iter().filter(|limit| limit.1 == condition);
-        over_pairs(here.map(|limit| (limit.0.as_str(), of(&limit.2))))
+        let limits = by_pair(here.map(|limit| (limit.0.as_str(), of(&limit.2))));
+        Spread::of(&limits.into_values().collect::<Vec<_>>())
     }
 
     /// Tables for reading: the three measures, and how far above the bound each method is.
@@ -95,15 +117,16 @@ impl Report {
         for (what, value) in &self.about {
             let _ = writeln!(text, "- {what}: {value}");
         }
-        let methods = self.methods();
+        let (methods, first) = (self.methods(), self.faults.first().copied());
+        let noise = first.map_or(String::new(), |fault| format!(", noise: {fault}"));
         for (title, measure, decimals) in MEASURES {
             let limit = decimals == 2 && !self.limits.is_empty();
-            let _ = writeln!(text, "\n### {title} (mean ± standard error over pairs [pairs])\n");
+            let _ = writeln!(text, "\n### {title}{noise} (mean ± standard error over pairs [pairs])\n");
             self.heading(&mut text, &methods, if limit { &["limit, mean", "limit, median"] } else { &[] });
             for (condition, shown) in &self.conditions {
                 let _ = write!(text, "| {shown} |");
                 for method in &methods {
-                    let _ = write!(text, " {} |", cell(self.spread(condition, method, measure), decimals));
+                    let _ = write!(text, " {} |", cell(self.spread((condition, first, method), measure), decimals));
                 }
                 if limit {
                     for of in [|limit: &Limit| limit.epe, |limit: &Limit| limit.median] {
@@ -114,13 +137,13 @@ impl Report {
             }
         }
         if !self.limits.is_empty() {
-            let _ = writeln!(text, "\n### How far above the limit: mean end-point error over mean limit\n");
+            let _ = writeln!(text, "\n### How far above the limit: mean end-point error over mean limit{noise}\n");
             self.heading(&mut text, &methods, &[]);
             for (condition, shown) in &self.conditions {
                 let limit = self.limit(condition, |limit| limit.epe).map(|limit| limit.mean);
                 let _ = write!(text, "| {shown} |");
                 for method in &methods {
-                    let mean = self.spread(condition, method, |record| record.epe).map(|spread| spread.mean);
+                    let mean = self.spread((condition, first, method), |record| record.epe).map(|spread| spread.mean);
                     match (mean, limit) {
                         (Some(mean), Some(limit)) if limit > 0.0 => {
                             let _ = write!(text, " ×{:.1} |", mean / limit);
@@ -131,8 +154,41 @@ impl Report {
                 text.push('\n');
             }
         }
+        if !self.faults.is_empty() {
+            self.by_fault(&mut text, &methods);
+        }
         self.left_out(&mut text);
         text
+    }
+
+    /// A table a method: how end-point error moves with the kind of noise.
+    fn by_fault(&self, text: &mut String, methods: &[String]) {
+        let conditions: Vec<String> = self.conditions.iter().map(|(condition, _)| condition.clone()).collect();
+        let against = self.faults.iter().copied().find(|fault| *fault == Fault::None);
+        for method in methods {
+            let change = if against.is_some() { "; change against none of the same pairs" } else { "" };
+            let _ = writeln!(text, "\n### {method} by noise: end-point error, px{change}\n");
+            self.heading(text, &conditions, &[]);
+            for fault in &self.faults {
+                let _ = write!(text, "| {fault} |");
+                for condition in &conditions {
+                    let of = |fault| self.measured((condition, Some(fault), method), |record| record.epe);
+                    let here = of(*fault);
+                    let _ = write!(text, " {}", cell(Spread::of(&here.values().copied().collect::<Vec<_>>()), 2));
+                    let none = against.filter(|none| none != fault).map(of);
+                    if let Some(Spread { mean, error, .. }) = none.and_then(|none| change_of(&here, &none)) {
+                        // Nought has no sign but plus.
+                        let _ = write!(text, ", {:+.1}", (10.0 * mean).round() / 10.0 + 0.0);
+                        if error.is_finite() {
+                            let _ = write!(text, " ± {error:.1}");
+                        }
+                        text.push_str(" %");
+                    }
+                    text.push_str(" |");
+                }
+                text.push('\n');
+            }
+        }
     }
 
     fn heading(&self, text: &mut String, methods: &[String], more: &[&str]) {
@@ -150,28 +206,33 @@ impl Report {
         }
     }
 
-    /// The mean table, one line a cell.
+    /// The mean table, one line a cell; with a column for the kind of noise where they are compared.
     pub fn csv(&self) -> String {
-        let mut text =
-            String::from("condition,method,pairs,epe,epe_error,fl_all,aae,limit_epe,limit_rms,limit_median\n");
+        let mut text = String::from("condition,");
+        text.push_str(if self.faults.is_empty() { "" } else { "fault," });
+        text.push_str("method,pairs,epe,epe_error,fl_all,aae,limit_epe,limit_rms,limit_median\n");
         for (condition, _) in &self.conditions {
             let limits = [|limit: &Limit| limit.epe, |limit: &Limit| limit.rms, |limit: &Limit| limit.median]
                 .map(|of| self.limit(condition, of).map_or(String::new(), |spread| format!("{:.5}", spread.mean)));
-            for method in self.methods() {
-                let [epe, fl, aae] = MEASURES.map(|(_, measure, _)| self.spread(condition, &method, measure));
-                if let (Some(epe), Some(fl), Some(aae)) = (epe, fl, aae) {
-                    let error = if epe.error.is_finite() { format!("{:.5}", epe.error) } else { String::new() };
-                    let _ = writeln!(
-                        text,
-                        "{},{},{},{:.5},{error},{:.5},{:.5},{}",
-                        quoted(condition),
-                        quoted(&method),
-                        epe.count,
-                        epe.mean,
-                        fl.mean / 100.0,
-                        aae.mean,
-                        limits.join(",")
-                    );
+            for fault in self.kinds() {
+                let kind = fault.map_or(String::new(), |fault| format!("{fault},"));
+                for method in self.methods() {
+                    let [epe, fl, aae] =
+                        MEASURES.map(|(_, measure, _)| self.spread((condition, fault, &method), measure));
+                    if let (Some(epe), Some(fl), Some(aae)) = (epe, fl, aae) {
+                        let error = if epe.error.is_finite() { format!("{:.5}", epe.error) } else { String::new() };
+                        let _ = writeln!(
+                            text,
+                            "{},{kind}{},{},{:.5},{error},{:.5},{:.5},{}",
+                            quoted(condition),
+                            quoted(&method),
+                            epe.count,
+                            epe.mean,
+                            fl.mean / 100.0,
+                            aae.mean,
+                            limits.join(",")
+                        );
+                    }
                 }
             }
         }
@@ -215,7 +276,8 @@ impl Report {
         root: &DrawingArea<SVGBackend<'_>, plotters::coord::Shift>,
     ) -> Result<(), Box<dyn std::error::Error>> {
         let methods = self.methods();
-        let epe = |condition: &str, method: &str| self.spread(condition, method, |record| record.epe);
+        let first = self.faults.first().copied();
+        let epe = |condition: &str, method: &str| self.spread((condition, first, method), |record| record.epe);
         let line = |of: &dyn Fn(&str) -> Option<Spread>| -> Vec<(f64, Spread)> {
             let shown = self.conditions.iter().enumerate();
             shown.filter_map(|(at, (condition, _))| Some((at as f64, of(condition)?))).collect()
@@ -271,14 +333,26 @@ impl Report {
 /// Stands between a pair's name and the number of the draw of its noise.
 pub const DRAW: char = '~';
 
-/// Spread over pairs; several draws of one pair's noise are no further pairs, they are averaged first.
-fn over_pairs<'a>(values: impl Iterator<Item = (&'a str, f64)>) -> Option<Spread> {
+/// A value a pair; several draws of one pair's noise are no further pairs, they are averaged.
+fn by_pair<'a>(values: impl Iterator<Item = (&'a str, f64)>) -> BTreeMap<&'a str, f64> {
     let mut pairs: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
     for (name, value) in values {
         pairs.entry(name.split(DRAW).next().unwrap_or(name)).or_default().push(value);
     }
-    let means: Vec<f64> = pairs.values().map(|draws| draws.iter().sum::<f64>() / draws.len() as f64).collect();
-    Spread::of(&means)
+    pairs.into_iter().map(|(pair, draws)| (pair, draws.iter().sum::<f64>() / draws.len() as f64)).collect()
+}
+
+/// By how many percent the mean over the pairs that both know has changed, and the standard error of that, in which
+/// what makes one pair harder than another has no part.
+fn change_of(now: &BTreeMap<&str, f64>, before: &BTreeMap<&str, f64>) -> Option<Spread> {
+    let both: Vec<[f64; 2]> = now.iter().filter_map(|(pair, now)| Some([*now, *before.get(pair)?])).collect();
+    let mean = |of: usize| both.iter().map(|pair| pair[of]).sum::<f64>() / both.len() as f64;
+    let (after, base) = (mean(0), mean(1));
+    // The error of a ratio of two means, to first order: of each pair's distance from the common ratio.
+    let ratio = after / base;
+    let apart: Vec<f64> = both.iter().map(|[now, before]| 100.0 * (now - ratio * before) / base).collect();
+    let spread = Spread::of(&apart).filter(|_| base > 0.0)?;
+    Some(Spread { mean: 100.0 * (ratio - 1.0), ..spread })
 }
 
 /// `1.59 ± 0.33 [9]`; a single pair has no error.

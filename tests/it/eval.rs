@@ -31,7 +31,7 @@ fn uniform(width: usize, height: usize, vector: [f32; 2]) -> Field {
 }
 
 /// Smooth structure of many directions and all tones.
-fn textured(width: usize, height: usize, seed: u64) -> Picture {
+pub fn textured(width: usize, height: usize, seed: u64) -> Picture {
     let mut draws = Normals::new(seed, 0);
     let waves: Vec<[f64; 5]> = (0..24)
         .map(|_| {
@@ -83,12 +83,12 @@ fn scores_are_those_computed_by_hand() {
 }
 
 /// Writes a frame and makes its folders.
-fn frame(path: PathBuf) {
+pub fn frame(path: PathBuf) {
     fs::create_dir_all(path.parent().unwrap()).unwrap();
     textured(24, 16, 3).write(&path).unwrap();
 }
 
-fn truth(path: PathBuf) {
+pub fn truth(path: PathBuf) {
     fs::create_dir_all(path.parent().unwrap()).unwrap();
     flow_files::write(&path, &uniform(24, 16, [1.5, -2.0])).unwrap();
 }

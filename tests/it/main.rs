@@ -8,6 +8,7 @@ mod bags;
 mod darkness;
 mod eval;
 mod exposure;
+mod faults;
 mod fcdn;
 mod flow;
 mod flow_files;

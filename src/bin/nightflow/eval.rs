@@ -9,6 +9,7 @@ use nightflow::{
         bound,
         datasets::{self, Found, Item, KINDS, Kind, Skipped},
         enhance::Enhancer,
+        faults::Fault,
         flow_files::Field,
         ladder::{Linear, MEANS, Sensor},
         methods::{Enhancing, Method, Shown},
@@ -60,6 +61,7 @@ Examples:
   nightflow eval ladder pairs/ --models pwcnet_fcdn,zero --out results
   nightflow eval ladder pairs/ --models zero --enhancers none,nlm --write dark
   nightflow eval ladder pairs/ --models raft=raft_small.onnx,dis=results/dis --enhancers none,nlm,gaussian:2
+  nightflow eval ladder pairs/ --models pwcnet_fcdn --faults none,rows,banding,fixed,tukey,10bit,jpeg8
 
 The limit is the Cramér–Rao bound of a square of 15 pixels (--patch) around each pixel.")]
 struct LadderArgs {
@@ -77,6 +79,11 @@ struct LadderArgs {
     /// How often each exposure is drawn; a pair's draws are averaged before the pairs are.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100))]
     draws: u32,
+    /// Noise besides the camera's, each on the whole ladder: none, rows, banding (drifts between frames), fixed (pattern,
+    /// the same in both frames), tukey (long-tailed read noise), 10bit, jpeg8 (what is shown is a JPEG). Several are
+    /// compared with none, a table a method; limits are of the first. Their pictures and flows are in folders as Exp-3_rows.
+    #[arg(long, value_delimiter = ',', default_value = "none")]
+    faults: Vec<Fault>,
     /// Side of the square that the limit is for, pixels, odd.
     #[arg(long, default_value_t = bound::PATCH)]
     patch: usize,
@@ -124,7 +131,7 @@ pub fn run(args: Args) -> Result<Exit> {
                 bail!("--patch is {}; expected an odd number of pixels, as 15", ladder.patch);
             }
             let sensor = Sensor::find(&ladder.camera, ladder.iso)?;
-            let about = vec![
+            let mut about = vec![
                 (
                     "camera".to_owned(),
                     format!(
@@ -134,7 +141,16 @@ pub fn run(args: Args) -> Result<Exit> {
                 ),
                 ("limit".to_owned(), format!("Cramér–Rao, a square of {0} × {0} pixels", ladder.patch)),
             ];
-            let light = Light::Ladder { sensor, seed: ladder.seed, patch: ladder.patch };
+            let mut faults: Vec<Fault> = vec![];
+            for fault in &ladder.faults {
+                if !faults.contains(fault) {
+                    faults.push(*fault);
+                }
+            }
+            if faults != [Fault::None] {
+                about.extend(faults.iter().map(|fault| (format!("noise {fault}"), fault.about().to_owned())));
+            }
+            let light = Light::Ladder { sensor, seed: ladder.seed, patch: ladder.patch, faults };
             evaluate(&ladder.pairs, &light, &ladder.how, about, ladder.draws)
         }
         (None, Some(dataset)) => {
@@ -149,13 +165,24 @@ pub fn run(args: Args) -> Result<Exit> {
 enum Light {
     AsItIs,
     Linear,
-    Ladder { sensor: Sensor, seed: u64, patch: usize },
+    Ladder { sensor: Sensor, seed: u64, patch: usize, faults: Vec<Fault> },
+}
+
+impl Light {
+    /// How many exposures a pair is shown at, and with what noise each.
+    fn views(&self) -> (usize, &[Fault]) {
+        match self {
+            Self::Ladder { faults, .. } => (MEANS.len(), faults),
+            _ => (1, &[Fault::None]),
+        }
+    }
 }
 
 /// A pair in one light.
 struct View {
     condition: String,
     shown: String,
+    fault: Fault,
     frames: [Picture; 2],
     truths: Vec<(String, Field)>,
     limit: Option<bound::Limit>,
@@ -180,25 +207,28 @@ fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, Str
     let layout = KINDS.iter().find(|(_, known)| *known == kind).map_or("", |(name, _)| name);
     about.insert(0, ("data".into(), format!("{} ({layout}), {} pairs", folder.display(), items.len())));
     about.extend(methods.iter().map(|method| (method.name.clone(), method.about())));
-    let mut report = Report { about, skipped, ..Report::default() };
+    let (rungs, faults) = light.views();
+    // With the camera's own noise alone nothing is compared.
+    let compared = if faults == [Fault::None] { vec![] } else { faults.to_vec() };
+    let mut report = Report { about, skipped, faults: compared, ..Report::default() };
     // The name seeds the noise, so that another draw is the same pair by another name.
     let again = |item: &Item, draw: u32| match draw {
         0 => item.clone(),
         _ => Item { name: format!("{}{DRAW}{draw}", item.name), ..item.clone() },
     };
     let items: Vec<Item> = items.iter().flat_map(|item| (0..draws).map(move |draw| again(item, draw))).collect();
-    let rungs = if matches!(light, Light::Ladder { .. }) { MEANS.len() } else { 1 };
-    let bar = progress(items.len() * rungs * enhancers.len())?;
+    let steps = rungs * faults.len() * enhancers.len();
+    let bar = progress(items.len() * steps)?;
     for item in &items {
         bar.set_message(item.name.clone());
         match datasets::load(item) {
             Ok(loaded) => {
-                for view in views(item, loaded, light, rungs) {
-                    judge(item, view, &mut methods, &mut enhancers, how, &mut report, &bar)?;
+                for view in views(item, loaded, light) {
+                    judge(item, view?, &mut methods, &mut enhancers, how, &mut report, &bar)?;
                 }
             }
             Err(left) => {
-                bar.inc((rungs * enhancers.len()) as u64);
+                bar.inc(steps as u64);
                 report.skipped.push(left);
             }
         }
@@ -208,23 +238,28 @@ fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, Str
 }
 
 /// The pair in every light, made when its turn comes.
-fn views(item: &Item, loaded: datasets::Loaded, light: &Light, rungs: usize) -> impl Iterator<Item = View> {
+fn views(item: &Item, loaded: datasets::Loaded, light: &Light) -> impl Iterator<Item = Result<View>> {
     let linear = (!matches!(light, Light::AsItIs)).then(|| Linear::of([&loaded.frames[0], &loaded.frames[1]]));
-    (0..rungs).map(move |at| {
+    let (rungs, faults) = light.views();
+    let turns = (0..rungs).flat_map(move |at| faults.iter().map(move |fault| (at, *fault)));
+    turns.map(move |(at, fault)| {
         let truths = loaded.truths.clone();
         let whole = (item.condition.clone(), item.condition.clone());
         let (condition, shown, frames, limit) = match (light, &linear) {
-            (Light::Ladder { sensor, seed, patch }, Some(linear)) => {
-                let rung = linear.expose(sensor, MEANS[at], *seed, &item.name);
-                let limit = truths.first().and_then(|(_, truth)| bound::limit(&rung, truth, *patch));
+            (Light::Ladder { sensor, seed, patch, .. }, Some(linear)) => {
+                let rung = linear.expose(&Sensor { fault, ..*sensor }, MEANS[at], *seed, &item.name);
+                // It is of white noise, the same for every kind.
+                let truth = truths.first().filter(|_| faults.first() == Some(&fault));
+                let limit = truth.and_then(|(_, truth)| bound::limit(&rung, truth, *patch));
                 let noise = 255.0 * rung.noise.variance(1, 0.4).sqrt();
                 let shown = format!("Exp-{at} (mean {}, noise {noise:.1}/255)", MEANS[at]);
-                (format!("Exp-{at}"), shown, rung.pictures(), limit)
+                let [older, newer] = rung.pictures();
+                (format!("Exp-{at}"), shown, [fault.shown(older)?, fault.shown(newer)?], limit)
             }
             (Light::Linear, Some(linear)) => (whole.0, whole.1, linear.scaled(), None),
             _ => (whole.0, whole.1, loaded.frames.clone(), None),
         };
-        View { condition, shown, frames, truths, limit }
+        Ok(View { condition, shown, fault, frames, truths, limit })
     })
 }
 
@@ -253,7 +288,11 @@ fn judge(
         }
         report.limits.extend(view.limit.map(|limit| (item.name.clone(), condition, limit)));
     }
-    let folder = view.condition.replace([' ', '/'], "_");
+    let light = match view.fault {
+        Fault::None => view.condition.clone(),
+        fault => format!("{} {fault}", view.condition),
+    };
+    let folder = light.replace([' ', '/'], "_");
     for enhancing in enhancers {
         let by = enhancing.by.to_string();
         let frames = [enhancing.enhance(&view.frames[0])?, enhancing.enhance(&view.frames[1])?];
@@ -263,7 +302,7 @@ fn judge(
         }
         for method in methods.iter_mut().filter(|method| method.covers(&enhancing.by)) {
             let shown = Shown { frames: [&frames[0], &frames[1]], place: &place };
-            let what = format!("{} by {} ({by}, {})", item.name, method.name, view.condition);
+            let what = format!("{} by {} ({by}, {light})", item.name, method.name);
             let found = match method.flow(&shown) {
                 Ok(found) => found,
                 // Others' results may be torn; a network that fails is no matter of one pair.
@@ -277,7 +316,9 @@ fn judge(
                 match score(&found, field) {
                     Some(score) => {
                         let condition = sorted(truth).0;
-                        report.records.push(Record::new(&item.name, &condition, &by, &method.name, score));
+                        let record = Record::new(&item.name, &condition, &by, &method.name, score);
+                        let fault = (!report.faults.is_empty()).then_some(view.fault);
+                        report.records.push(Record { fault, ..record });
                     }
                     None => report.skipped.push(Skipped { what: what.clone(), why: mismatch(&found, field) }),
                 }

@@ -64,7 +64,7 @@ enum Command {
     Show(show::Args),
     /// Make recordings with known truth, and data sets for the dark.
     /// Judge methods on data sets with true flow, by exposure; climb down the brightness ladder.
-    Eval(eval::Args),
+    Eval(Box<eval::Args>),
     /// Measure a camera's noise on its raw frames.
     #[command(subcommand)]
     Noise(noise::Command),
@@ -95,7 +95,7 @@ fn main() -> ExitCode {
         Command::Doctor(args) => doctor::run(args),
         Command::Config(args) => config::run(args),
         Command::Show(args) => show::run(&args).map(|()| Exit::Done),
-        Command::Eval(args) => eval::run(args),
+        Command::Eval(args) => eval::run(*args),
         Command::Noise(command) => noise::run(command).map(|()| Exit::Done),
         Command::Synth(command) => synth::run(command).map(|()| Exit::Done),
     };
