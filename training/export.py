@@ -1,6 +1,7 @@
-"""Writes a trained network as two ONNX graphs, checks them against PyTorch, and enters them in the manifest."""
+"""Writes a trained network as ONNX graphs, checks them against PyTorch, and enters them in the manifest."""
 
 import argparse
+import contextlib
 import hashlib
 import io
 import tomllib
@@ -13,10 +14,12 @@ import torch
 from torch import nn
 
 import checkpoints
-from networks import PwcNet
+from networks import GAIN, PwcNet
 from raft import RaftSmall
 
 OPSET = 17
+# Of operators that are not ONNX's own, and their version.
+DOMAIN, DOMAIN_VERSION = "nightflow", 1
 FRAMES = ("older", "newer")
 LARGEST_FILE = 20_000_000
 PARITY_PX = 1e-3
@@ -54,6 +57,38 @@ class PairGraph(nn.Module):
         of = lambda matched, n: (None if self.fast else level2[n], matched, context)
         flows, expected = self.decoder(of(older, 0), of(newer, 1), self.fast)
         return (4.0 * flows[-1]).permute(0, 2, 3, 1) * scale, expected[:, 0]
+
+
+class CostVolume(torch.autograd.Function):
+    """A level's match as the node's own operator `nightflow::CostVolume`, which warps, multiplies and seeks the maximum in one
+    go. models/README.md defines it; tracing asks for shapes only."""
+
+    @staticmethod
+    def forward(ctx, older, newer, flow, sharpness, reach: int):
+        return older.new_zeros(1, (2 * reach + 1) ** 2, *older.shape[2:]), torch.zeros_like(flow)
+
+    @staticmethod
+    def symbolic(g, older, newer, flow, sharpness, reach: int):
+        inputs = (older, newer, flow, sharpness)
+        volume, argmax = g.op(f"{DOMAIN}::CostVolume", *inputs, reach_i=reach, gain_f=GAIN, outputs=2)
+        volume.setType(older.type().with_sizes([1, (2 * reach + 1) ** 2, None, None]))
+        argmax.setType(flow.type().with_sizes([1, 2, None, None]))
+        return volume, argmax
+
+
+@contextlib.contextmanager
+def fused(network: PwcNet):
+    """Within it the decoder's levels match by the one operator."""
+    levels = (network.decoder.shared, network.decoder.fine)
+    for level in levels:
+        level.match = lambda older, newer, flow, tile, fetch, level=level: CostVolume.apply(
+            older, newer, flow, level.sharpness, level.reach
+        )
+    try:
+        yield
+    finally:
+        for level in levels:
+            del level.match
 
 
 class RaftFrameGraph(nn.Module):
@@ -113,18 +148,21 @@ def with_half_weights(graph: onnx.ModelProto) -> onnx.ModelProto:
     return graph
 
 
-def traced(module: nn.Module, inputs: tuple, names: list[str], outputs: list[str], axes: dict) -> onnx.ModelProto:
+def traced(
+    module: nn.Module, inputs: tuple, names: list[str], outputs: list[str], axes: dict, domains: dict | None = None
+) -> onnx.ModelProto:
     """An ONNX graph of a module with dynamic rows and columns."""
     memory = io.BytesIO()
     torch.onnx.export(
         module, inputs, memory, input_names=names, output_names=outputs, dynamic_axes=axes, opset_version=OPSET,
-        dynamo=False, do_constant_folding=True,
+        dynamo=False, do_constant_folding=True, custom_opsets=domains,
     )
     return onnx.load_from_string(memory.getvalue())
 
 
 def graphs_of(network: nn.Module) -> dict[str, onnx.ModelProto]:
-    """`pyramid` and `decoder` graphs of a network in evaluation mode."""
+    """`pyramid` and `decoder` graphs of a network in evaluation mode, and `fused`, the decoder with the node's own operator,
+    of a PWC-Net."""
     graphs = (RaftFrameGraph, RaftPairGraph) if isinstance(network, RaftSmall) else (FrameGraph, PairGraph)
     frame, pair = (graph(network).eval() for graph in graphs)
     image = torch.rand(1, 3, GOLDEN_HEIGHT, GOLDEN_WIDTH)
@@ -140,11 +178,18 @@ def graphs_of(network: nn.Module) -> dict[str, onnx.ModelProto]:
         {"image": {2: "height", 3: "width"}, **{name: axes(name) for name in frame.names}},
     )
     raster = {1: "rows_level2", 2: "columns_level2"}
-    decoder = traced(
-        pair, (*inputs.values(), torch.ones(2)), [*inputs, "scale"], ["flow", "uncertainty"],
-        {"flow": raster, "uncertainty": raster, **{name: axes(name) for name in inputs}},
-    )
-    return {"pyramid": with_half_weights(pyramid), "decoder": with_half_weights(decoder)}
+
+    def decoder(domains: dict | None = None) -> onnx.ModelProto:
+        return traced(
+            pair, (*inputs.values(), torch.ones(2)), [*inputs, "scale"], ["flow", "uncertainty"],
+            {"flow": raster, "uncertainty": raster, **{name: axes(name) for name in inputs}}, domains,
+        )
+
+    graphs = {"pyramid": pyramid, "decoder": decoder()}
+    if isinstance(network, PwcNet):
+        with fused(network):
+            graphs["fused"] = decoder({DOMAIN: DOMAIN_VERSION})
+    return {part: with_half_weights(graph) for part, graph in graphs.items()}
 
 
 class Exported:
@@ -250,13 +295,15 @@ def export(arguments: argparse.Namespace, network: nn.Module, state: dict, name:
     network.eval().load_state_dict(state["mean"])
     files = {}
     for part, graph in graphs_of(network).items():
-        files[part] = arguments.models / f"{arguments.name if part == 'pyramid' else name}_{part}.onnx"
+        file = {"pyramid": f"{arguments.name}_pyramid", "fused": f"{name}_decoder_fused"}.get(part, f"{name}_{part}")
+        files[part] = arguments.models / f"{file}.onnx"
         onnx.checker.check_model(graph)
         written = graph.SerializeToString()
         if len(written) > LARGEST_FILE:
             raise SystemExit(f"{files[part].name}: expected at most {LARGEST_FILE} bytes, got {len(written)}")
         files[part].write_bytes(written)
-    exported = Exported(*(str(file) for file in files.values()))
+    # The fused graph needs the node's operator: the node's tests compare it with the plain one.
+    exported = Exported(str(files["pyramid"]), str(files["decoder"]))
     for height, width in ((128, 192), (256, 320), (512, 640)):
         worst = parity(rounded(network), exported, *moved(height, width, height))
         print(f"{height}x{width}: graphs and PyTorch differ by at most {worst:.1e} px")

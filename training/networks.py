@@ -28,6 +28,8 @@ DECODER_CHANNELS = (128, 128, 96, 64, 32)
 NARROW_CHANNELS = (64, 64, 32)
 CONTEXT = ((64, 1), (64, 2), (64, 4), (64, 8), (32, 1))
 REACH, NARROW_REACH = 4, 2
+# The cost volume is a mean of products of unit deviation; the convolutions want it larger.
+GAIN = 4.0
 # Columns a tile of the cost volume has; inputs are multiples of 64 wide, so these divide the levels' widths.
 TILES = {2: 16, 3: 8}
 LEVEL_WEIGHTS = (0.2, 0.3, 0.4, 0.6, 1.0)
@@ -144,15 +146,19 @@ class LevelDecoder(nn.Module):
         dy, dx = torch.meshgrid(offsets, offsets, indexing="ij")
         self.register_buffer("offsets", torch.stack([dx.flatten(), dy.flatten()]), persistent=False)
 
-    def forward(self, older, newer, context, flow, above, tile, fetch=True):
-        """Flow [B, 2, H, W] and body features, from those of the level above at this level's size."""
+    def match(self, older, newer, flow, tile, fetch):
+        """GAIN times the cost volume around the flow, and its soft arg-max. One operator in the fused graph of export.py."""
         fetched = warp(newer.float(), flow).to(newer.dtype) if fetch else newer
         volume = cost_volume(older, fetched, tile, self.reach)
         pooled = F.avg_pool2d(volume.float(), 3, 1, 1, count_include_pad=False)
         weights = torch.softmax(pooled * self.sharpness.exp(), 1)
-        argmax = torch.einsum("bdyx,cd->bcyx", weights, self.offsets)
+        return volume * GAIN, torch.einsum("bdyx,cd->bcyx", weights, self.offsets)
+
+    def forward(self, older, newer, context, flow, above, tile, fetch=True):
+        """Flow [B, 2, H, W] and body features, from those of the level above at this level's size."""
+        volume, argmax = self.match(older, newer, flow, tile, fetch)
         # Flow is of the size of a cost volume's reach, and larger at large motion only.
-        parts = [volume * 4, argmax.to(volume.dtype), context, (0.25 * flow).to(volume.dtype), above]
+        parts = [volume, argmax.to(volume.dtype), context, (0.25 * flow).to(volume.dtype), above]
         features = self.body(torch.cat(parts, 1))
         residual = self.predict(features).float()
         return flow + residual[:, :2] + torch.sigmoid(residual[:, 2:]) * argmax, features

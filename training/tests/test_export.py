@@ -66,6 +66,25 @@ def test_weights_are_stored_in_half_precision(fresh):
         assert large and all(t.data_type == onnx.TensorProto.FLOAT16 for t in large)
 
 
+def test_the_fused_decoder_is_called_alike_and_matches_by_the_one_operator(fresh):
+    network, graphs, _ = fresh
+    if not isinstance(network, PwcNet):
+        assert "fused" not in graphs
+        return
+    plain, fused = (onnx.load_from_string(graphs[part]) for part in ("decoder", "fused"))
+    assert plain.graph.input == fused.graph.input
+    assert [output.name for output in plain.graph.output] == [output.name for output in fused.graph.output]
+    assert not {"MatMul", "Einsum", "Softmax", "GridSample"} & {node.op_type for node in fused.graph.node}
+    reaches = []
+    for node in fused.graph.node:
+        if node.op_type == "CostVolume":
+            given = {attribute.name: onnx.helper.get_attribute_value(attribute) for attribute in node.attribute}
+            assert node.domain == "nightflow" and given["gain"] == 4.0
+            reaches.append(given["reach"])
+    # Levels 5, 4, 3 and 3 again, then level 2.
+    assert reaches == [4, 4, 4, 4] + ([] if network.fast else [2])
+
+
 def test_golden_frames_follow_their_formula():
     older, newer = golden_frames()
     c, y, x = 2, 50, 70
@@ -88,11 +107,11 @@ def test_committed_files_are_those_of_the_manifest():
     manifest = tomllib.loads((MODELS / "manifest.toml").read_text())
     assert manifest
     for entry in manifest.values():
-        paths = [MODELS / entry[part]["file"] for part in ("pyramid", "decoder")]
-        for part, path in zip(("pyramid", "decoder"), paths):
+        paths = {part: MODELS / entry[part]["file"] for part in ("pyramid", "decoder", "fused") if part in entry}
+        for part, path in paths.items():
             assert hashlib.sha256(path.read_bytes()).hexdigest() == entry[part]["sha256"]
             assert path.stat().st_size <= 20_000_000
-        outputs = Exported(*(str(path) for path in paths))(*golden_frames())
+        outputs = Exported(str(paths["pyramid"]), str(paths["decoder"]))(*golden_frames())
         rows, columns = np.ix_(GOLDEN_ROWS, GOLDEN_COLUMNS)
         for key, output in zip(("flow", "uncertainty"), outputs):
             golden = np.array(entry["golden"][key])
