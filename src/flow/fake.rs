@@ -1,7 +1,7 @@
 //! Networks without weights: a known shift and a plain block matcher, for tests where the weights do not matter.
 
 use crate::flow::{
-    Error,
+    Error, Operators,
     network::{Model, Network, Raster, Slot},
     padding::Padded,
 };
@@ -52,7 +52,8 @@ impl Fake {
     }
 
     fn new(name: &str, answer: Answer) -> Self {
-        let model = Model { name: name.into(), version: "0".into(), provider: "none".into(), ..Model::default() };
+        let (version, operators) = ("0".into(), Operators::Plain);
+        let model = Model { name: name.into(), version, operators, provider: "none".into(), ..Model::default() };
         Self { answer, uncertainty: 0.1, frames: Default::default(), model }
     }
 }

@@ -24,6 +24,8 @@ pub struct Entry {
     pub pyramid: File,
     /// The graph that finds the flow between two frames' features.
     pub decoder: File,
+    /// The same decoder with the operators of [`crate::flow::cost_volume`], if there is one.
+    pub fused: Option<File>,
     /// What the exporter noted.
     pub golden: Option<Golden>,
 }

@@ -1,6 +1,7 @@
 //! Stage 3: two developed images become dense optical flow with a confidence for every vector.
 
 mod config;
+pub mod cost_volume;
 mod error;
 mod fake;
 mod golden;
@@ -19,7 +20,7 @@ pub mod wheel;
 use crate::clock::Stamp;
 
 pub use self::{
-    config::{Config, REASONS, Resolution},
+    config::{Config, Operators, REASONS, Resolution},
     error::Error,
     fake::Fake,
     golden::Deviation,

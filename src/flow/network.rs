@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use crate::flow::{Error, padding::Padded};
+use crate::flow::{Error, Operators, padding::Padded};
 
 /// Which of the two places for a frame's features.
 ///
@@ -79,6 +79,8 @@ pub struct Model {
     pub version: String,
     /// sha256 of each of its files, by file name: the pyramid, then the decoder.
     pub sha256: Vec<(String, String)>,
+    /// What computes its cost volumes.
+    pub operators: Operators,
     /// What really computes it, with its version.
     pub provider: String,
     /// The library that computes it; empty where there is none.

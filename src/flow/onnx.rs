@@ -12,9 +12,10 @@ use ort::{
     session::{IoBinding, Session, builder::GraphOptimizationLevel},
     value::{Outlet, Shape, Tensor, TensorRefMut, ValueType},
 };
+use tracing::info;
 
 use crate::flow::{
-    Config, Error,
+    Config, Error, Operators, cost_volume,
     manifest::{self, Kind},
     network::{Golden, Model, Network, Raster, Slot},
     padding::Padded,
@@ -116,6 +117,8 @@ impl Graph {
             .map_err(failed(doing))?
             .with_config_entry(provider::RECORD, "1")
             .map_err(failed(doing))?
+            .with_operators(cost_volume::domain().map_err(failed("make its operators"))?)
+            .map_err(failed(doing))?
             .commit_from_memory(bytes)
             .map_err(failed("load a graph"))?;
         let binding = session.create_binding().map_err(failed("bind"))?;
@@ -176,14 +179,30 @@ fn features(entry: &manifest::Entry, pyramid: &Graph, decoder: &Graph) -> Result
     Ok(given)
 }
 
+/// What computes the cost volumes; the entry's decoder becomes the graph for it.
+fn chosen(config: &Config, entry: &mut manifest::Entry) -> Operators {
+    match (config.operators, entry.fused.take()) {
+        (Operators::Fused, Some(fused)) => {
+            entry.decoder = fused;
+            Operators::Fused
+        }
+        (Operators::Fused, None) => {
+            info!("{} has no graph with fused operators, its plain one runs", config.network);
+            Operators::Plain
+        }
+        (Operators::Plain, _) => Operators::Plain,
+    }
+}
+
 impl Onnx {
     /// Finds the library and the network that the settings name, and checks both.
     pub fn open(config: &Config) -> Result<Self, Error> {
         let (environment, library) = environment(config)?;
         let executable = env::current_exe().ok();
         let folder = manifest::folder(&config.models, executable.as_deref());
-        let entry = manifest::entry(&folder, &config.network)?;
+        let mut entry = manifest::entry(&folder, &config.network)?;
         let Kind::PyramidDecoder = entry.kind;
+        let operators = chosen(config, &mut entry);
         let open = |file| Graph::open(&environment, &manifest::read(&folder, file)?, config.threads);
         let (pyramid, decoder) = (open(&entry.pyramid)?, open(&entry.decoder)?);
         let features = features(&entry, &pyramid, &decoder)?;
@@ -200,7 +219,7 @@ impl Onnx {
             memory: None,
             scale: Tensor::from_array(([2usize], vec![1.0f32, 1.0])).map_err(failed("reserve memory"))?,
             golden: entry.golden,
-            model: Model { name: config.network.clone(), version: entry.version, sha256, provider, library },
+            model: Model { name: config.network.clone(), version: entry.version, sha256, operators, provider, library },
             copied: 0,
         })
     }

@@ -12,6 +12,7 @@ mod faults;
 mod fcdn;
 mod flow;
 mod flow_files;
+mod fused;
 mod iceoryx2;
 mod latest;
 mod launch_configs;

@@ -107,7 +107,13 @@ fn network(config: &Config) -> Vec<(&'static str, Finding)> {
         ("runtime", Finding::Ok(format!("{}, {}", model.provider, model.library.display()))),
         (
             "model",
-            Finding::Ok(format!("{} {}, sha256 as in the manifest: {}", model.name, model.version, files.join(", "))),
+            Finding::Ok(format!(
+                "{} {}, {} operators, sha256 as in the manifest: {}",
+                model.name,
+                model.version,
+                model.operators,
+                files.join(", ")
+            )),
         ),
         ("golden output", golden),
         ("speed", speed(&mut matcher)),

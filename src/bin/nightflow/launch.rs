@@ -88,6 +88,7 @@ pub fn provenance(config: &Config, network: Option<&Matcher>) -> Result<BTreeMap
         known.insert("model".to_owned(), format!("{} {}", model.name, model.version));
         let files: Vec<String> = model.sha256.iter().map(|(file, hash)| format!("{file} {hash}")).collect();
         known.insert("model_sha256".to_owned(), files.join(", "));
+        known.insert("operators".to_owned(), model.operators.to_string());
         known.insert("provider".to_owned(), model.provider.clone());
     }
     Ok(known)

@@ -1,0 +1,87 @@
+//! Rows of planes, cut into bands that different threads may write at the same time.
+
+use std::{
+    marker::PhantomData,
+    sync::atomic::{AtomicU64, Ordering},
+};
+
+/// The most bands that there can be.
+pub const MOST: usize = 64;
+
+/// Planes of `height` rows of `width` values, whose rows are handed out in bands, each of them once.
+pub struct Bands<'a> {
+    start: *mut f32,
+    planes: usize,
+    height: usize,
+    width: usize,
+    /// Rows of a band; the last may have fewer.
+    rows: usize,
+    taken: AtomicU64,
+    memory: PhantomData<&'a mut [f32]>,
+}
+
+// SAFETY: what a thread gets are bands, each handed out once, and no two bands share a row.
+unsafe impl Sync for Bands<'_> {}
+
+impl<'a> Bands<'a> {
+    /// Cuts `memory` into bands of so many rows, at most [`MOST`] of them.
+    pub fn new(memory: &'a mut [f32], [planes, height, width]: [usize; 3], rows: usize) -> Self {
+        assert!(
+            planes * height * width <= memory.len() && height <= MOST * rows,
+            "{planes} × {height} × {width}, {rows}"
+        );
+        Self { start: memory.as_mut_ptr(), planes, height, width, rows, taken: AtomicU64::new(0), memory: PhantomData }
+    }
+
+    /// The band of this number; nothing if there is none or somebody has it already.
+    pub fn take(&self, number: usize) -> Option<Band<'_>> {
+        let first = number.checked_mul(self.rows).filter(|first| *first < self.height)?;
+        let bit = 1 << number;
+        // Nothing else is told by this bit than whose the band is.
+        let taken = self.taken.fetch_or(bit, Ordering::Relaxed) & bit != 0;
+        (!taken).then_some(Band { bands: self, first, end: (first + self.rows).min(self.height) })
+    }
+}
+
+/// Some rows of every plane.
+pub struct Band<'a> {
+    bands: &'a Bands<'a>,
+    /// Its first row.
+    pub first: usize,
+    /// The row after its last.
+    pub end: usize,
+}
+
+impl Band<'_> {
+    /// A row of a plane.
+    #[inline(always)]
+    pub fn row(&mut self, plane: usize, row: usize) -> &mut [f32] {
+        let Bands { start, planes, height, width, .. } = *self.bands;
+        assert!(plane < planes && row >= self.first && row < self.end);
+        // SAFETY: the row lies within the memory that `Bands::new` borrowed for good and measured; it belongs to this band
+        // alone, which was handed out once and is borrowed here.
+        unsafe { std::slice::from_raw_parts_mut(start.add((plane * height + row) * width), width) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_row_is_handed_out_once() {
+        let mut memory = vec![0.0; 2 * 5 * 3];
+        let bands = Bands::new(&mut memory, [2, 5, 3], 2);
+        for number in [2, 0, 1] {
+            let mut band = bands.take(number).unwrap();
+            assert_eq!((band.first, band.end), (2 * number, (2 * number + 2).min(5)));
+            for row in band.first..band.end {
+                band.row(1, row).fill(row as f32);
+            }
+            assert!(bands.take(number).is_none());
+        }
+        assert!(bands.take(3).is_none() && bands.take(usize::MAX).is_none());
+        assert_eq!(memory[..15], [0.0; 15]);
+        assert_eq!(memory[15..], [0., 0., 0., 1., 1., 1., 2., 2., 2., 3., 3., 3., 4., 4., 4.]);
+    }
+}

@@ -1,0 +1,173 @@
+//! Fused graphs: the same flow as the plain ones give, for every network of the manifest that has one.
+
+use std::path::{Path, PathBuf};
+
+use nightflow::{
+    clock::Stamp,
+    exposure::{Exposed, Pair},
+    flow::{
+        Config, Matcher, Operators, Own,
+        cost_volume::{CostVolume, Inputs, Outputs, Shape, Unfit},
+    },
+};
+
+use crate::allocations::{self, Allocations};
+
+/// How far a fused graph's flow and confidence may lie from the plain one's, in pixels.
+const APART: f32 = 1e-4;
+/// The same for vectors of more than ten pixels, as a part of them: floats have no more than seven digits.
+const APART_PART: f32 = 1e-5;
+
+fn models() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("models")
+}
+
+/// Every network with a fused graph.
+fn networks() -> Vec<String> {
+    let manifest = std::fs::read_to_string(models().join("manifest.toml")).unwrap();
+    let table: toml::Table = manifest.parse().unwrap();
+    let found: Vec<String> =
+        table.into_iter().filter(|(_, entry)| entry.get("fused").is_some()).map(|(name, _)| name).collect();
+    assert!(!found.is_empty(), "no network of the manifest has a fused graph");
+    found
+}
+
+/// Opens a network; its golden check has passed then.
+fn open(network: &str, operators: Operators, threads: usize) -> Matcher {
+    let config = Config { network: network.into(), models: models(), operators, threads, ..Config::default() };
+    let matcher = Matcher::open(&config).expect("the committed network opens and passes its golden check");
+    assert_eq!(matcher.model().operators, operators);
+    let fused = matcher.model().sha256[1].0.ends_with("_decoder_fused.onnx");
+    assert_eq!(fused, operators == Operators::Fused, "{:?}", matcher.model());
+    matcher
+}
+
+fn exposed(width: usize, height: usize, number: u64, value: impl Fn(usize, usize, usize) -> f32) -> Exposed {
+    let cells = (0..3).flat_map(|c| (0..height).flat_map(move |y| (0..width).map(move |x| (c, y, x))));
+    Exposed {
+        stamp: Stamp::from_ns(number as i64 * 33_000_000),
+        width,
+        height,
+        scale: [1.0, 1.0],
+        rgb: cells.map(|(c, y, x)| value(c, y, x)).collect(),
+        saturated: vec![0; width * height],
+        raw_mean: 0.05,
+        gain: 8.0,
+        generation: number,
+        ..Exposed::default()
+    }
+}
+
+/// The golden picture, as models/README.md defines it.
+fn golden(width: usize, height: usize, number: u64, moved: (f64, f64)) -> Exposed {
+    exposed(width, height, number, |c, y, x| {
+        let (x, y) = (x as f64 - moved.0, y as f64 - moved.1);
+        let wave = (0.20 * x + 0.13 * y + c as f64).sin() * (0.17 * y - 0.05 * x).cos();
+        (0.4 + 0.25 * wave) as f32
+    })
+}
+
+/// Nothing but noise, which matches anywhere.
+fn noise(width: usize, height: usize, number: u64) -> Exposed {
+    exposed(width, height, number, |c, y, x| {
+        let mut hash = (number << 40 | (c << 32 | y << 16 | x) as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        hash ^= hash >> 29;
+        hash = hash.wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        (hash >> 40) as f32 / (1u64 << 24) as f32
+    })
+}
+
+/// Flow and confidence.
+fn between(matcher: &mut Matcher, [older, newer]: &[Exposed; 2]) -> (Vec<f32>, Vec<f32>) {
+    let mut own = Own::default();
+    let flow = matcher.between(&Pair { older, newer, gain_step: None }, &mut own).unwrap();
+    (flow.vectors.to_vec(), flow.confidence.to_vec())
+}
+
+#[test]
+fn a_fused_graph_gives_the_plain_ones_flow() {
+    let mut pairs = vec![[golden(192, 128, 1, (0.0, 0.0)), golden(192, 128, 2, (2.0, 1.0))]];
+    // Far more than the finest levels reach, so that the coarse ones fetch from far and from outside.
+    pairs.push([golden(320, 256, 3, (0.0, 0.0)), golden(320, 256, 4, (-23.0, 17.0))]);
+    for (number, (width, height)) in [(64, 64), (128, 64), (150, 90), (320, 256), (64, 448)].into_iter().enumerate() {
+        let number = 2 * number as u64 + 5;
+        pairs.push([noise(width, height, number), noise(width, height, number + 1)]);
+    }
+    for network in networks() {
+        let [mut plain, mut fused] = [Operators::Plain, Operators::Fused].map(|operators| open(&network, operators, 2));
+        for pair in &pairs {
+            let (wanted, found) = (between(&mut plain, pair), between(&mut fused, pair));
+            let apart = |wanted: &[f32], found: &[f32]| {
+                assert_eq!(wanted.len(), found.len());
+                // In units of what is allowed.
+                let apart = |(a, b): (&f32, &f32)| (a - b).abs() / APART.max(APART_PART * a.abs());
+                wanted.iter().zip(found).map(apart).fold(0.0, f32::max)
+            };
+            let (flow, confidence) = (apart(&wanted.0, &found.0), apart(&wanted.1, &found.1));
+            let size = format!("{network}, {} × {}", pair[0].width, pair[0].height);
+            println!("{size}: flow {flow:.3} of what is allowed, confidence {confidence:.3}");
+            assert!(
+                flow <= 1.0 && confidence <= 1.0,
+                "{size}: flow {flow} times what is allowed, confidence {confidence}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_fused_graph_gives_the_same_bits_again() {
+    let pair = [golden(320, 256, 1, (0.0, 0.0)), golden(320, 256, 2, (2.0, 1.0))];
+    for network in networks() {
+        let bits = |matcher: &mut Matcher| -> Vec<u32> {
+            let (flow, confidence) = between(matcher, &pair);
+            flow.iter().chain(&confidence).map(|value| value.to_bits()).collect()
+        };
+        let mut two = open(&network, Operators::Fused, 2);
+        let first = bits(&mut two);
+        assert!(first == bits(&mut two) && first == bits(&mut open(&network, Operators::Fused, 2)));
+    }
+}
+
+#[test]
+fn a_network_without_a_fused_graph_runs_its_plain_one() {
+    let matcher = Matcher::open(&Config { network: "raftsmall_fcdn_4".into(), ..Config::default() }).unwrap();
+    assert_eq!(matcher.model().operators, Operators::Plain);
+}
+
+#[test]
+fn a_cost_volume_takes_memory_at_the_first_call_of_a_size_only() {
+    let shape = Shape { channels: 32, height: 24, width: 40, reach: 4 };
+    let features: Vec<f32> = (0..32 * 24 * 40).map(|i| (i as f32 * 0.37).sin()).collect();
+    let flow = vec![0.4; 2 * 24 * 40];
+    let (mut volume, mut argmax) = (vec![0.0; 81 * 24 * 40], vec![0.0; 2 * 24 * 40]);
+    let mut work = CostVolume::default();
+    let mut run = || {
+        let inputs = Inputs { older: &features, newer: &features, flow: &flow, sharpness: 1.0, gain: 4.0 };
+        let outputs = Outputs { volume: &mut volume, argmax: &mut argmax };
+        let spread = |count: usize, work: &(dyn Fn(usize) + Sync)| -> Result<(), Unfit> {
+            (0..count).for_each(work);
+            Ok(())
+        };
+        work.compute(shape, &inputs, outputs, spread).unwrap();
+    };
+    assert!(allocations::during(&mut run).1.calls > 0);
+    assert_eq!(allocations::during(|| (0..10).for_each(|_| run())).1, Allocations { calls: 0, peak: 0 });
+}
+
+#[test]
+fn a_fused_step_takes_no_more_memory_than_a_plain_one() {
+    let pair = [golden(192, 128, 1, (0.0, 0.0)), golden(192, 128, 2, (2.0, 1.0))];
+    for network in networks() {
+        let taken = [Operators::Plain, Operators::Fused].map(|operators| {
+            let mut matcher = open(&network, operators, 2);
+            let mut own = Own::default();
+            let mut run = || {
+                let [older, newer] = &pair;
+                matcher.between(&Pair { older, newer, gain_step: None }, &mut own).map(drop).unwrap();
+            };
+            (0..3).for_each(|_| run());
+            allocations::during(|| (0..5).for_each(|_| run())).1.calls
+        });
+        assert_eq!(taken[0], taken[1], "{network}");
+    }
+}
