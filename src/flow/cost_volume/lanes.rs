@@ -181,6 +181,8 @@ macro_rules! by_intrinsics {
         #[derive(Debug, Clone, Copy)]
         pub struct $name(());
 
+        // Where a feature is part of the target, as NEON is of aarch64, its intrinsics are safe.
+        #[allow(unused_unsafe)]
         impl Lanes for $name {
             const COUNT: usize = $count;
             type V = $register;
