@@ -1,9 +1,9 @@
 //! What the fused cost volume gains: `cargo bench --bench network`, with `-- models FOLDER` for other models.
 //!
 //! Everything that is compared runs in turns, so that other work on the machine strikes both alike; figures are medians.
-//! Decoders run through ONNX Runtime, as in the node. The cost volume alone runs on one thread and is compared with its
-//! sliced form in Rust (a product and a mean for each displacement, as a graph of ONNX's operators does it, after the same
-//! warp) and with the time that its inputs and outputs would take at the rate of a copy.
+//! Decoders run through ONNX Runtime, as in the node. The cost volume alone, with its warp and soft arg-max, runs on one
+//! thread and is compared with its sliced form in Rust (a product and a mean for each displacement, as a graph of ONNX's
+//! operators does it; without warp and arg-max, so that it does less) and with a copy of as many bytes as go in and out.
 
 use std::{collections::BTreeSet, hint::black_box, path::PathBuf, process::ExitCode, time::Instant};
 

@@ -256,11 +256,15 @@ fn group<L: Lanes, const N: usize>(
     for (both, row) in older.chunks_exact(2 * L::COUNT).zip(fetched.chunks_exact(stride)) {
         let (upper, lower) = (lanes.load(both), lanes.load(&both[L::COUNT..]));
         let row = &row[from..from + L::COUNT + N - 1];
-        for k in 0..N {
-            let seen = lanes.load(&row[k..]);
-            sums[0][k] = lanes.fused(upper, seen, sums[0][k]);
-            sums[1][k] = lanes.fused(lower, seen, sums[1][k]);
+        // Written out, for a loop may leave the sums in memory.
+        macro_rules! each {
+            ($($k:literal)*) => { $(if $k < N {
+                let seen = lanes.load(&row[$k..]);
+                sums[0][$k] = lanes.fused(upper, seen, sums[0][$k]);
+                sums[1][$k] = lanes.fused(lower, seen, sums[1][$k]);
+            })* };
         }
+        each!(0 1 2 3 4);
     }
     sums
 }
