@@ -12,6 +12,10 @@ demo:
 test:
     cargo test
 
+# The trainer's tests, in an environment of their own under target/trainer.
+train-test:
+    training/check.sh
+
 # What CI runs.
 ci:
     .ci/run

@@ -3,6 +3,7 @@
 //! Flights over `darkness::flight`'s ground are photographed at the ladder's seven exposures and go through the node's
 //! own stages: exposure, a network, odometer. Gyro (noise and bias), range, stamps, attitude and the gyro's clock err as
 //! much as the settings say. Flow may be kept in a folder (`--cache`), so that a change of the fit is judged in seconds.
+//! A network's name with `+refine` or `-refine` behind it is judged with and without the last step by the images' gradients.
 
 use std::{
     path::PathBuf,

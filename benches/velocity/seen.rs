@@ -78,13 +78,19 @@ struct Kept {
     steps: Vec<Vec<(bool, Option<f32>)>>,
 }
 
+/// Behind a network's name: its vectors go through `[flow] refine`, or don't, whatever the default is.
+const REFINING: [(&str, bool); 2] = [("+refine", true), ("-refine", false)];
+
 /// Settings of the node for the flights' camera.
-pub fn settings(network: &str) -> Config {
+pub fn settings(method: &str) -> Config {
     let mut config = Config::default();
     config.exposure.bit_depth = Some(12);
     config.exposure.black_level = Some(f32::from(flight::BLACK));
     config.exposure.white_level = Some(f32::from(flight::WHITE));
+    let refining = REFINING.into_iter().find_map(|(end, on)| Some((method.strip_suffix(end)?, on)));
+    let (network, refine) = refining.unwrap_or((method, config.flow.refine));
     config.flow.network = network.into();
+    config.flow.refine = refine;
     config.flow.threads = 1;
     config
 }
