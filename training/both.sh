@@ -11,5 +11,5 @@ for run in fcdn clean; do
 done
 for run in "${runs[@]}"; do wait "$run"; done
 for run in fcdn clean; do
-  "$python" export.py "runs/gpu_$run/checkpoint" --name "pwcnet_$run" --version "$version" --models runs/models
+  "$python" export.py "runs/gpu_$run/checkpoint" --fast --name "pwcnet_$run" --version "$version" --models runs/models
 done

@@ -277,6 +277,7 @@ def main() -> None:
     parser.add_argument("--version", required=True, help="such as 2026-11-22.1")
     parser.add_argument("--models", type=Path, default=Path("../models"))
     parser.add_argument("--iterations", type=int, nargs="+", help="for RAFT-small: a network for each, as 8 4 12")
+    parser.add_argument("--fast", action="store_true", help="for PWC-Net: also NAME_fast, which ends at level 3")
     arguments = parser.parse_args()
     state = checkpoints.load(arguments.checkpoint)
     if (state["kind"] == "raftsmall") != bool(arguments.iterations):
@@ -284,7 +285,8 @@ def main() -> None:
     arguments.models.mkdir(parents=True, exist_ok=True)
     if state["kind"] == "pwcnet":
         export(arguments, PwcNet(), state, arguments.name)
-        export(arguments, PwcNet(fast=True), state, f"{arguments.name}_fast")
+        if arguments.fast:
+            export(arguments, PwcNet(fast=True), state, f"{arguments.name}_fast")
     for iterations in arguments.iterations or []:
         first = iterations == arguments.iterations[0]
         export(arguments, RaftSmall(iterations), state, arguments.name if first else f"{arguments.name}_{iterations}")
