@@ -5,7 +5,13 @@
 //! thread and is compared with its sliced form in Rust (a product and a mean for each displacement, as a graph of ONNX's
 //! operators does it; without warp and arg-max, so that it does less) and with a copy of as many bytes as go in and out.
 
-use std::{collections::BTreeSet, hint::black_box, path::PathBuf, process::ExitCode, time::Instant};
+use std::{
+    collections::BTreeSet,
+    hint::black_box,
+    path::{Path, PathBuf},
+    process::ExitCode,
+    time::Instant,
+};
 
 use multiversion::multiversion;
 use nightflow::{
@@ -66,7 +72,7 @@ fn medians<const N: usize>(rounds: usize, things: &mut [&mut dyn FnMut(); N]) ->
 }
 
 /// Networks that have a fused graph, by the manifest.
-fn networks(models: &PathBuf) -> Result<BTreeSet<String>, String> {
+fn networks(models: &Path) -> Result<BTreeSet<String>, String> {
     let path = models.join("manifest.toml");
     let text = std::fs::read_to_string(&path).map_err(|error| format!("{}: {error}", path.display()))?;
     let table: toml::Table = text.parse().map_err(|error| format!("{}: {error}", path.display()))?;
@@ -74,7 +80,7 @@ fn networks(models: &PathBuf) -> Result<BTreeSet<String>, String> {
 }
 
 /// The decoder with both kinds of operators: a pair's features are kept, so that only the decoder runs.
-fn decoders(models: &PathBuf, rounds: Rounds) -> Result<(), String> {
+fn decoders(models: &Path, rounds: Rounds) -> Result<(), String> {
     println!("decoder, ms            plain    fused    plain/fused");
     for network in networks(models)? {
         for (width, height) in SIZES {
@@ -83,7 +89,7 @@ fn decoders(models: &PathBuf, rounds: Rounds) -> Result<(), String> {
                 let open = |operators| {
                     let config = Config {
                         network: network.clone(),
-                        models: models.clone(),
+                        models: models.into(),
                         operators,
                         threads,
                         golden_check: false,

@@ -5,7 +5,7 @@ use std::{fs, path::Path, process::Command};
 use nightflow::{
     clock::Stamp,
     exposure::{Exposed, Pair},
-    flow::{Cause, Config, Error, Fake, Flow, Grid, Lender, Matcher, Own, Resolution, State, runtime},
+    flow::{Cause, Config, Error, Fake, Flow, Grid, Lender, Matcher, Operators, Own, Resolution, State, runtime},
 };
 
 /// A textured scene seen through a window that stands at `at`.
@@ -386,17 +386,18 @@ fn refusal(folder: &Path) -> String {
 
 #[test]
 fn a_model_with_one_changed_byte_is_refused() {
-    let folder = models();
-    let path = folder.path().join("pwcnet_fcdn_decoder.onnx");
-    let mut bytes = fs::read(&path).unwrap();
-    let middle = bytes.len() / 2;
-    bytes[middle] ^= 1;
-    fs::write(&path, bytes).unwrap();
-    let text = refusal(folder.path());
-    assert!(text.contains("MODELS/pwcnet_fcdn_decoder.onnx") && text.contains("has sha256"), "{text}");
-    // Not even with the golden check left out.
-    let config = Config { models: folder.path().into(), golden_check: false, ..Config::default() };
-    assert!(matches!(Matcher::open(&config), Err(Error::Hash { .. })));
+    let files = [(Operators::Fused, "pwcnet_fcdn_decoder_fused.onnx"), (Operators::Plain, "pwcnet_fcdn_decoder.onnx")];
+    for (operators, file) in files {
+        let folder = models();
+        let mut bytes = fs::read(folder.path().join(file)).unwrap();
+        bytes[1_000_000] ^= 1;
+        fs::write(folder.path().join(file), bytes).unwrap();
+        let config = Config { models: folder.path().into(), operators, ..Config::default() };
+        let text = Matcher::open(&config).map(drop).unwrap_err().to_string();
+        assert!(text.contains(file) && text.contains("has sha256"), "{text}");
+        let config = Config { golden_check: false, ..config };
+        assert!(matches!(Matcher::open(&config), Err(Error::Hash { .. })), "also without the golden check");
+    }
 }
 
 #[test]
@@ -418,7 +419,10 @@ fn a_missing_network_or_manifest_is_named() {
     let folder = models();
     let config = Config { models: folder.path().into(), network: "raft".into(), ..Config::default() };
     let text = Matcher::open(&config).map(drop).unwrap_err().to_string();
-    assert!(text.contains("network raft is not in it, it has pwcnet_fcdn, raftsmall_fcdn"), "{text}");
+    assert!(
+        text.contains("network raft is not in it, it has pwcnet_clean, pwcnet_fcdn, pwcnet_fcdn_fast, raftsmall_fcdn"),
+        "{text}"
+    );
     fs::remove_file(folder.path().join("manifest.toml")).unwrap();
     let text = refusal(folder.path());
     insta::assert_snapshot!(text, @"MODELS/manifest.toml: No such file or directory (os error 2); set [flow] models to the folder of the models");
