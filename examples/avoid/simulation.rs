@@ -164,7 +164,6 @@ fn config(settings: &Settings) -> Config {
     config.exposure.black_level = Some(f32::from(course::BLACK));
     config.exposure.white_level = Some(f32::from(course::WHITE));
     config.flow.network.clone_from(&settings.network);
-    config.flow.refine = true;
     config.motion.camera = Mount::Forward;
     config.motion.obstacles = Some(obstacles::Config { horizon_s: HORIZON_S, ..obstacles::Config::default() });
     config

@@ -95,7 +95,9 @@ impl Method {
     pub fn open(given: &str, config: &Config) -> Result<Self, Error> {
         let network = |name: &str, folder: Option<&Path>| {
             let models = folder.map_or_else(|| config.models.clone(), Path::to_path_buf);
-            let config = Config { network: name.into(), models, resolution: Resolution::Full, ..config.clone() };
+            // The network itself is judged. What follows it in the node needs to know the camera's noise.
+            let (resolution, refine) = (Resolution::Full, false);
+            let config = Config { network: name.into(), models, resolution, refine, ..config.clone() };
             Ok::<_, Error>(Way::Network(Box::new(Matcher::open(&config)?), 0))
         };
         let Some((name, path)) = given.split_once('=') else {

@@ -147,8 +147,8 @@ impl Default for Config {
             inlier_part_min: 0.25,
             seed_rad: 0.004,
             agree_rad_max: 0.015,
-            flow_shared_sd_cells: 0.01,
-            flow_shared_sd_part: 0.005,
+            flow_shared_sd_cells: 0.0005,
+            flow_shared_sd_part: 0.001,
             clock_offset_s_max: 0.002,
             turn_scale_off_max: 0.1,
             seed: 1,
@@ -193,9 +193,10 @@ pub const REASONS: &[(&str, &str)] = &[
     ("agree_rad_max", "beyond six such pixels nothing is noise, whatever the spread of the rest"),
     (
         "flow_shared_sd_cells",
-        "0.04 network pixels: what residuals can't show, for the fit takes it for motion (cargo bench --bench velocity)",
+        "0.002 network pixels: what residuals can't show, for the fit takes it for motion (cargo bench --bench velocity); \
+         0.01 cells for vectors that [flow] refine = false leaves as the network gives them",
     ),
-    ("flow_shared_sd_part", "the same bench, where the displacement is long"),
+    ("flow_shared_sd_part", "the same bench, where the displacement is long; 0.005 without refining"),
     ("clock_offset_s_max", "at 1 rad/s² it turns 2 mrad/s that nobody made; twice what gyro_offset_sd_s counts with"),
     (
         "turn_scale_off_max",

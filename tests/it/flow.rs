@@ -39,13 +39,18 @@ fn pair<'a>(older: &'a Exposed, newer: &'a Exposed) -> Pair<'a> {
     Pair { older, newer, gain_step: None }
 }
 
+/// What the network gives, and no more.
+fn quarter() -> Config {
+    Config { refine: false, ..Config::default() }
+}
+
 fn full() -> Config {
-    Config { resolution: Resolution::Full, ..Config::default() }
+    Config { resolution: Resolution::Full, ..quarter() }
 }
 
 /// A real network, if its golden check passes.
 fn named(network: &str) -> Matcher {
-    let config = Config { network: network.into(), ..Config::default() };
+    let config = Config { network: network.into(), ..quarter() };
     Matcher::open(&config).expect("the committed network opens and passes its golden check")
 }
 
@@ -55,7 +60,7 @@ fn real() -> Matcher {
 
 #[test]
 fn a_known_shift_comes_back_in_camera_pixels_at_every_size() {
-    for config in [Config::default(), full()] {
+    for config in [quarter(), full()] {
         for (width, height) in [(320, 256), (100, 75), (64, 64), (30, 17), (3, 2), (1, 1)] {
             let mut older = frame(width, height, (0.0, 0.0), 1);
             older.scale = [4.0, 3.0];
@@ -79,7 +84,7 @@ fn a_known_shift_comes_back_in_camera_pixels_at_every_size() {
 
 #[test]
 fn block_matching_finds_a_moved_scene_at_odd_sizes_and_on_both_rasters() {
-    for config in [Config::default(), full()] {
+    for config in [quarter(), full()] {
         // The window goes (3, −2), so the scene goes (−3, 2).
         let (older, newer) = (frame(150, 90, (0.0, 0.0), 1), frame(150, 90, (3.0, -2.0), 2));
         let mut matcher = Matcher::with(&config, Box::new(Fake::matching(5)));
@@ -131,7 +136,7 @@ fn padding_changes_nothing(mut matcher: Matcher, sizes: &[(usize, usize)]) {
 
 #[test]
 fn an_odd_size_gives_what_padding_by_hand_gives() {
-    let fake = Matcher::with(&Config::default(), Box::new(Fake::matching(3)));
+    let fake = Matcher::with(&quarter(), Box::new(Fake::matching(3)));
     padding_changes_nothing(fake, &[(100, 60), (65, 127), (37, 41), (130, 64)]);
     padding_changes_nothing(real(), &[(100, 60), (70, 129)]);
 }
@@ -140,7 +145,7 @@ fn an_odd_size_gives_what_padding_by_hand_gives() {
 fn the_full_raster_is_the_quarter_raster_between_its_cells() {
     let (older, newer) = (frame(128, 128, (0.0, 0.0), 1), frame(128, 128, (1.5, 0.5), 2));
     let (mut coarse, mut fine) = (Own::default(), Own::default());
-    let quarter = Matcher::with(&Config::default(), Box::new(Fake::matching(4)))
+    let quarter = Matcher::with(&quarter(), Box::new(Fake::matching(4)))
         .between(&pair(&older, &newer), &mut coarse)
         .unwrap()
         .vectors
@@ -171,7 +176,7 @@ fn the_full_raster_is_the_quarter_raster_between_its_cells() {
 
 #[test]
 fn features_are_computed_once_a_frame_and_again_when_the_gain_changes() {
-    let mut matcher = Matcher::with(&Config::default(), Box::new(Fake::matching(1)));
+    let mut matcher = Matcher::with(&quarter(), Box::new(Fake::matching(1)));
     let mut own = Own::default();
     let mut older = frame(64, 64, (0.0, 0.0), 1);
     for number in 2..=10 {
@@ -195,11 +200,11 @@ fn features_are_computed_once_a_frame_and_again_when_the_gain_changes() {
 #[test]
 fn kept_features_give_the_flow_that_fresh_ones_give() {
     let frames: Vec<_> = (1..=5).map(|n| frame(64, 64, (n as f64 * n as f64 * 0.5, 0.0), n)).collect();
-    let mut kept = Matcher::with(&Config::default(), Box::new(Fake::matching(6)));
+    let mut kept = Matcher::with(&quarter(), Box::new(Fake::matching(6)));
     for two in frames.windows(2) {
         let (mut a, mut b) = (Own::default(), Own::default());
         let kept = kept.between(&pair(&two[0], &two[1]), &mut a).unwrap();
-        let mut fresh = Matcher::with(&Config::default(), Box::new(Fake::matching(6)));
+        let mut fresh = Matcher::with(&quarter(), Box::new(Fake::matching(6)));
         let fresh = fresh.between(&pair(&two[0], &two[1]), &mut b).unwrap();
         assert_eq!(kept.vectors, fresh.vectors);
     }
@@ -212,7 +217,7 @@ fn saturated_cells_and_matches_outside_have_no_confidence() {
     older.saturated_part = 1.0 / 4096.0;
     let mut newer = Exposed { generation: 2, saturated: vec![0; 4096], ..older.clone() };
     newer.saturated[31 * 64 + 31] = 1; // where cell (6, 6), of centre (25.5, 25.5), goes under (5.5, 5.5)
-    let mut matcher = Matcher::with(&Config::default(), Box::new(Fake::shift(5.5, 5.5).with_uncertainty(1.0)));
+    let mut matcher = Matcher::with(&quarter(), Box::new(Fake::shift(5.5, 5.5).with_uncertainty(1.0)));
     let mut own = Own::default();
     let flow = matcher.between(&pair(&older, &newer), &mut own).unwrap();
     let at = |row: usize, column: usize| flow.confidence[row * 16 + column];
@@ -225,7 +230,7 @@ fn saturated_cells_and_matches_outside_have_no_confidence() {
 #[test]
 fn flow_that_is_no_number_spoils_the_step_and_is_counted() {
     let (older, newer) = (frame(70, 64, (0.0, 0.0), 1), frame(70, 64, (0.0, 0.0), 2));
-    let mut matcher = Matcher::with(&Config::default(), Box::new(Fake::shift(f32::NAN, 1.0)));
+    let mut matcher = Matcher::with(&quarter(), Box::new(Fake::shift(f32::NAN, 1.0)));
     let error = matcher.between(&pair(&older, &newer), &mut Own::default()).unwrap_err();
     insta::assert_snapshot!(error, @"the network gave 512 of 1024 flow values and 0 of 512 uncertainties that are not finite");
 }
@@ -233,7 +238,7 @@ fn flow_that_is_no_number_spoils_the_step_and_is_counted() {
 #[test]
 fn frames_that_make_no_pair_are_refused() {
     let (older, newer) = (frame(64, 64, (0.0, 0.0), 1), frame(64, 60, (0.0, 0.0), 2));
-    let mut matcher = Matcher::with(&Config::default(), Box::new(Fake::shift(0.0, 0.0)));
+    let mut matcher = Matcher::with(&quarter(), Box::new(Fake::shift(0.0, 0.0)));
     let error = matcher.between(&pair(&older, &newer), &mut Own::default()).unwrap_err();
     insta::assert_snapshot!(error, @"the older frame (width, height, scale) is (64, 64, [4.0, 4.0]), the newer (64, 60, [4.0, 4.0])");
     let torn = Exposed { rgb: vec![0.0; 7], ..older.clone() };
@@ -248,7 +253,7 @@ fn state(uncertainty: f32, change: impl Fn(&mut Exposed, &mut Option<f32>)) -> S
     let mut gain_step = None;
     change(&mut newer, &mut gain_step);
     let pair = Pair { older: &older, newer: &newer, gain_step };
-    let mut matcher = Matcher::with(&Config::default(), Box::new(Fake::shift(0.0, 0.0).with_uncertainty(uncertainty)));
+    let mut matcher = Matcher::with(&quarter(), Box::new(Fake::shift(0.0, 0.0).with_uncertainty(uncertainty)));
     let mut own = Own::default();
     let flow: Flow = matcher.between(&pair, &mut own).unwrap();
     let (state, mean) = matcher.judge(&pair, &flow);

@@ -118,7 +118,7 @@ fn noise_makes_degraded_and_blind_at_the_same_level_for_every_camera() {
     let mut means = Vec::new();
     // A quiet sensor, and one with forty times its variance.
     for camera in [[2.5e-5, 2e-7], [1e-3, 8e-6]] {
-        for (level, word) in [(12.0, "ok"), (24.0, "ok"), (38.0, "degraded"), (75.0, "blind")] {
+        for (level, word) in [(12.0, "ok"), (24.0, "ok"), (38.0, "degraded"), (94.0, "blind")] {
             let mean = mean_at(level, camera);
             let mut pipeline = pipeline();
             assert!(step(&mut pipeline, &frame(0, mean, camera)).is_none());
@@ -129,7 +129,7 @@ fn noise_makes_degraded_and_blind_at_the_same_level_for_every_camera() {
             let right = match (&moved.state, word) {
                 (State::Ok, "ok") => true,
                 (State::Degraded(Cause::Noisy { allowed, .. }), "degraded") => *allowed == 30.0,
-                (State::Blind(Cause::Noisy { allowed, .. }), "blind") => *allowed == 60.0,
+                (State::Blind(Cause::Noisy { allowed, .. }), "blind") => *allowed == 75.0,
                 _ => false,
             };
             assert!(right, "level {level} should be {word}, found {:?}", moved.state);
