@@ -90,7 +90,7 @@ pub fn settings(method: &str) -> Config {
     let refining = REFINING.into_iter().find_map(|(end, on)| Some((method.strip_suffix(end)?, on)));
     let (network, refine) = refining.unwrap_or((method, config.flow.refine));
     config.flow.network = network.into();
-    config.flow.refine = refine;
+    config.flow.refine = refine && !METHODS.contains(&network);
     config.flow.threads = 1;
     config
 }
