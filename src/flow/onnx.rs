@@ -9,7 +9,10 @@ use std::{
 use ort::{
     environment::Environment,
     memory::{Allocator, MemoryInfo},
-    session::{IoBinding, Session, builder::GraphOptimizationLevel},
+    session::{
+        IoBinding, Session,
+        builder::{GraphOptimizationLevel, SessionBuilder},
+    },
     value::{Outlet, Shape, Tensor, TensorRefMut, ValueType},
 };
 use tracing::info;
@@ -96,6 +99,14 @@ pub(super) fn environment(config: &Config) -> Result<Loaded, Error> {
     Err(Error::Runtime { tried })
 }
 
+/// Loads a graph, one at a time in a process: ONNX Runtime (1.24) writes the name of our operators' domain into a table that
+/// all sessions read, without a lock, and two at once fail (microsoft/onnxruntime issue 22663) or worse.
+pub(super) fn load(mut builder: SessionBuilder, bytes: &[u8]) -> Result<Session, Error> {
+    static LOADING: Mutex<()> = Mutex::new(());
+    let _alone = LOADING.lock().unwrap_or_else(PoisonError::into_inner);
+    builder.commit_from_memory(bytes).map_err(failed("load a graph"))
+}
+
 impl Graph {
     /// Sequential, with a fixed number of threads: the order of every sum is fixed, so a replay gives the same bytes.
     fn open(environment: &Environment, bytes: &[u8], threads: usize) -> Result<Self, Error> {
@@ -118,9 +129,8 @@ impl Graph {
             .with_config_entry(provider::RECORD, "1")
             .map_err(failed(doing))?
             .with_operators(cost_volume::domain().map_err(failed("make its operators"))?)
-            .map_err(failed(doing))?
-            .commit_from_memory(bytes)
-            .map_err(failed("load a graph"))?;
+            .map_err(failed(doing))?;
+        let session = load(session, bytes)?;
         let binding = session.create_binding().map_err(failed("bind"))?;
         Ok(Self { binding, session })
     }

@@ -9,7 +9,7 @@ use ort::{
 
 use crate::flow::{
     Config, Error,
-    onnx::{environment, failed},
+    onnx::{environment, failed, load},
 };
 
 /// A graph whose inputs are images of one size and whose first output is taken.
@@ -32,9 +32,8 @@ impl Graph {
             .with_deterministic_compute(true)
             .map_err(failed(doing))?
             .with_optimization_level(GraphOptimizationLevel::All)
-            .map_err(failed(doing))?
-            .commit_from_memory(&bytes)
-            .map_err(failed("load a graph"))?;
+            .map_err(failed(doing))?;
+        let session = load(session, &bytes)?;
         let file = path.display().to_string();
         let found: Vec<String> = session.inputs().iter().map(|outlet| outlet.name().to_owned()).collect();
         if found.len() != inputs {

@@ -185,3 +185,29 @@ fn a_fused_step_takes_no_more_memory_than_a_plain_one() {
         assert_eq!(taken[0], taken[1], "{network}");
     }
 }
+
+/// One test of a process that has opened no network yet, which is when opening at once went wrong.
+#[test]
+fn networks_open_from_many_threads_at_once() {
+    if std::env::var_os("NIGHTFLOW_OPEN_AT_ONCE").is_some() {
+        let gate = std::sync::Barrier::new(6);
+        std::thread::scope(|scope| {
+            for _ in 0..6 {
+                scope.spawn(|| {
+                    gate.wait();
+                    open("pwcnet_fcdn_fast", Operators::Fused, 1);
+                });
+            }
+        });
+        return;
+    }
+    // Without the lock some three of ten such starts fail.
+    for _ in 0..8 {
+        let child = std::process::Command::new(std::env::current_exe().unwrap())
+            .args(["--exact", "fused::networks_open_from_many_threads_at_once"])
+            .env("NIGHTFLOW_OPEN_AT_ONCE", "1")
+            .output()
+            .unwrap();
+        assert!(child.status.success(), "{}", String::from_utf8_lossy(&child.stdout));
+    }
+}
