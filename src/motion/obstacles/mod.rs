@@ -10,6 +10,7 @@ mod config;
 mod heading;
 mod mover;
 mod sector;
+mod surface;
 mod texture;
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};

@@ -4,14 +4,10 @@ use nalgebra::Vector2;
 
 use super::{
     Config, SECTORS, Sector,
-    cell::{Cell, Scene, hypot},
+    cell::{Cell, Scene},
+    surface,
 };
 
-/// Cells within this many deviations are of one surface.
-const SURFACE_SDS: f64 = 2.5;
-/// The part of an error that all vectors share by which those of one sector differ.
-const APART_PART: f64 = 0.25;
-const ROUNDS: usize = 6;
 /// A sector whose deviation is below this part of the inverse horizon needs no wider view.
 const SURE_PART: f64 = 0.3;
 /// The part that one surface must fill of each sector of a wider view before it warns.
@@ -172,44 +168,28 @@ impl Sectors {
         if all < needed {
             return None;
         }
+        surface::nearest(&mut self.order, cells, shared, needed)?;
         let cell = |i: &u32| &cells[*i as usize];
-        // What all vectors share moves neighbours alike, and does not set them apart.
-        let sd = |cell: &Cell| hypot(cell.sd, APART_PART * shared * cell.by_shift.norm());
-        let least = |i: &u32| cell(i).closing - 2.0 * hypot(cell(i).sd, shared * cell(i).by_shift.norm());
-        self.order.sort_unstable_by(|a, b| least(b).total_cmp(&least(a)).then(a.cmp(b)));
-        let mut closing = cell(&self.order[needed - 1]).closing;
-        let within = |i: &&u32, closing: f64| (cell(i).closing - closing).abs() <= SURFACE_SDS * sd(cell(i));
-        for _ in 0..ROUNDS {
-            let (mut sum, mut weights) = (0.0, 0.0);
-            for i in self.order.iter().filter(|i| within(i, closing)) {
-                let weight = 1.0 / sd(cell(i)).powi(2);
-                (sum, weights) = (sum + weight * cell(i).closing, weights + weight);
-            }
-            if weights == 0.0 {
-                return None;
-            }
-            closing = sum / weights;
-        }
-        let (mut count, mut weights, mut stretch) = (0_usize, 0.0, 0.0);
+        let sd = |cell: &Cell| surface::sd(cell, shared);
+        let (count, mut weights, mut stretch) = (self.order.len(), 0.0, 0.0);
+        let mut sum = 0.0;
         let (mut by_shift, mut by_heading) = (Vector2::zeros(), Vector2::zeros());
-        for i in self.order.iter().filter(|i| within(i, closing)) {
+        for i in &self.order {
             let weight = 1.0 / sd(cell(i)).powi(2);
-            count += 1;
             weights += weight;
+            sum += weight * cell(i).closing;
             stretch += weight * cell(i).stretch;
             by_shift += cell(i).by_shift * weight;
             by_heading += cell(i).by_heading * weight;
         }
-        if count < needed {
-            return None;
-        }
+        let closing = sum / weights;
         (by_shift, by_heading) = (by_shift / weights, by_heading / weights);
         let heading = by_heading.dot(&(scene.heading.covariance * by_heading));
         let independent = (count as f64 / config.likeness_cells).max(1.0) / count as f64;
         let variance = 1.0 / (weights * independent) + heading + (shared * by_shift.norm()).powi(2);
         let part = |near: usize| {
             let members = &self.members[self.members(near)];
-            members.iter().filter(|i| within(i, closing)).count() as f64 / members.len() as f64
+            members.iter().filter(|i| surface::holds(cell(i), closing, shared)).count() as f64 / members.len() as f64
         };
         // NaN where a sector shows nothing.
         let filled =
