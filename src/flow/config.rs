@@ -35,6 +35,38 @@ impl std::fmt::Display for Operators {
     }
 }
 
+/// What computes the graphs; each must be built into the library that [`Config::runtime`] names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Provider {
+    /// ONNX Runtime's own kernels, which every library has.
+    #[default]
+    Cpu,
+    /// Intel's OpenVINO on the processor, also on AMD's.
+    OpenVino,
+    /// NVIDIA's CUDA and cuDNN. Not run here yet.
+    Cuda,
+    /// NVIDIA's TensorRT, CUDA for what it can't do. Not run here yet.
+    TensorRt,
+    /// XNNPACK, for ARM. Not run here yet.
+    Xnnpack,
+    /// The ARM Compute Library. Not run here yet.
+    Acl,
+}
+
+/// In how many bits convolutions multiply. Inputs, outputs and our own operators are of 32 bits always.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// 32 bits.
+    #[default]
+    Fp32,
+    /// 16 bits with the exponent of 32, by OpenVINO and TensorRT, on processors that have it.
+    Bf16,
+    /// 16 bits, by TensorRT and ACL.
+    Fp16,
+}
+
 /// `[flow]`; [`REASONS`] says why each default is what it is.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -49,6 +81,10 @@ pub struct Config {
     pub threads: usize,
     /// What computes the cost volumes; plain where the network has no fused graph.
     pub operators: Operators,
+    /// What computes the graphs.
+    pub provider: Provider,
+    /// In how many bits.
+    pub precision: Precision,
     /// What raster the flow is given on.
     pub resolution: Resolution,
     /// Move the network's vectors to where the images' gradients want them.
@@ -83,6 +119,8 @@ impl Default for Config {
             runtime: PathBuf::new(),
             threads: 2,
             operators: Operators::Fused,
+            provider: Provider::Cpu,
+            precision: Precision::Fp32,
             resolution: Resolution::Quarter,
             refine: true,
             gap_ms_max: 150.0,
@@ -115,6 +153,8 @@ pub const REASONS: &[(&str, &str)] = &[
         "operators",
         "fused: the same flow to a ten-thousandth of a pixel in less time; plain is for comparison and for other runtimes",
     ),
+    ("provider", "cpu: the library that the build fetches has no other; models/README.md says what others bring"),
+    ("precision", "fp32: what every processor has, and what the golden output was noted with"),
     (
         "resolution",
         "quarter: the network knows no more than that, and the samples of a finer raster are not independent",

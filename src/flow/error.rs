@@ -2,7 +2,10 @@
 
 use std::path::PathBuf;
 
-use crate::flow::runtime::{self, Tried};
+use crate::flow::{
+    Precision,
+    runtime::{self, Tried},
+};
 
 /// Why there is no network, or why it spoils a step.
 #[derive(Debug, thiserror::Error)]
@@ -83,6 +86,49 @@ pub enum Error {
         doing: &'static str,
         /// Its words.
         reason: String,
+    },
+    /// The library was built without the execution provider that the settings name.
+    #[error("[flow] provider = {wanted:?}: {} was built with {built} only. To have it: {remedy}", library.display())]
+    Provider {
+        /// The settings' word.
+        wanted: String,
+        /// The library.
+        library: PathBuf,
+        /// What it was built with, in the settings' words.
+        built: String,
+        /// What to do.
+        remedy: &'static str,
+    },
+    /// The execution provider does not compute in so many bits.
+    #[error("[flow] precision = \"{}\": provider {provider:?} can do {able}", format!("{precision:?}").to_lowercase())]
+    Precision {
+        /// The settings' word.
+        provider: String,
+        /// What is wanted.
+        precision: Precision,
+        /// What there is.
+        able: String,
+    },
+    /// The network was not shown to be as good in so many bits.
+    #[error(
+        "[flow] precision = \"{}\": {network} was not shown to keep its error in it to 2 %, it runs in fp32; pwcnet_fcdn was",
+        format!("{precision:?}").to_lowercase()
+    )]
+    Coarse {
+        /// The network.
+        network: String,
+        /// What is wanted.
+        precision: Precision,
+    },
+    /// ONNX Runtime gave no part of the network to the execution provider that the settings name.
+    #[error("[flow] provider = {wanted:?}: no node of {network} was given to it, all run on {found}")]
+    Unassigned {
+        /// The settings' word.
+        wanted: String,
+        /// The network.
+        network: String,
+        /// What runs instead.
+        found: String,
     },
     /// An image contradicts itself. Spoils one step.
     #[error("an image of {width} × {height} pixels has {rgb} values and {saturated} of saturation")]

@@ -8,7 +8,7 @@ use std::{
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
-use crate::flow::{Error, network::Golden};
+use crate::flow::{Error, Precision, network::Golden};
 
 /// What the manifest says of a network that comes as a pyramid and a decoder.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -26,6 +26,9 @@ pub struct Entry {
     pub decoder: File,
     /// The same decoder with the operators of [`crate::flow::cost_volume`], if there is one.
     pub fused: Option<File>,
+    /// Fewer bits than 32 in which its end-point error was measured to stay within 2 % down the brightness ladder.
+    #[serde(default)]
+    pub precisions: Vec<Precision>,
     /// What the exporter noted.
     pub golden: Option<Golden>,
 }

@@ -94,7 +94,7 @@ impl Matcher {
     /// where nothing was noted.
     pub fn check_golden(&mut self) -> Result<Option<Deviation>, Error> {
         self.described = [None; 2];
-        golden::check(self.network.as_mut())
+        golden::check(self.network.as_mut(), self.config.precision)
     }
 
     /// The raster of the flow of this frame. At quarter resolution it has a cell for every whole 4 × 4 pixels.

@@ -20,7 +20,7 @@ pub mod wheel;
 use crate::clock::Stamp;
 
 pub use self::{
-    config::{Config, Operators, REASONS, Resolution},
+    config::{Config, Operators, Precision, Provider, REASONS, Resolution},
     error::Error,
     fake::Fake,
     golden::Deviation,

@@ -18,7 +18,7 @@ use ort::{
 use tracing::info;
 
 use crate::flow::{
-    Config, Error, Operators, cost_volume,
+    Config, Error, Operators, Precision, cost_volume,
     manifest::{self, Kind},
     network::{Golden, Model, Network, Raster, Slot},
     padding::Padded,
@@ -109,11 +109,11 @@ pub(super) fn load(mut builder: SessionBuilder, bytes: &[u8]) -> Result<Session,
 
 impl Graph {
     /// Sequential, with a fixed number of threads: the order of every sum is fixed, so a replay gives the same bytes.
-    fn open(environment: &Environment, bytes: &[u8], threads: usize) -> Result<Self, Error> {
+    fn open((environment, library): &Loaded, bytes: &[u8], config: &Config) -> Result<Self, Error> {
         let doing = "set up a session";
         let session = Session::builder(environment)
             .map_err(failed(doing))?
-            .with_intra_threads(threads.max(1))
+            .with_intra_threads(config.threads.max(1))
             .map_err(failed(doing))?
             .with_inter_threads(1)
             .map_err(failed(doing))?
@@ -129,7 +129,9 @@ impl Graph {
             .with_config_entry(provider::RECORD, "1")
             .map_err(failed(doing))?
             .with_operators(cost_volume::domain().map_err(failed("make its operators"))?)
-            .map_err(failed(doing))?;
+            .map_err(failed(doing))?
+            .with_execution_providers(provider::wanted(config, library)?)
+            .map_err(failed("start the execution provider"))?;
         let session = load(session, bytes)?;
         let binding = session.create_binding().map_err(failed("bind"))?;
         Ok(Self { binding, session })
@@ -207,19 +209,25 @@ fn chosen(config: &Config, entry: &mut manifest::Entry) -> Operators {
 impl Onnx {
     /// Finds the library and the network that the settings name, and checks both.
     pub fn open(config: &Config) -> Result<Self, Error> {
-        let (environment, library) = environment(config)?;
+        let loaded = environment(config)?;
         let executable = env::current_exe().ok();
         let folder = manifest::folder(&config.models, executable.as_deref());
         let mut entry = manifest::entry(&folder, &config.network)?;
         let Kind::PyramidDecoder = entry.kind;
+        let precision = config.precision;
+        if precision != Precision::Fp32 && !entry.precisions.contains(&precision) {
+            return Err(Error::Coarse { network: config.network.clone(), precision });
+        }
         let operators = chosen(config, &mut entry);
-        let open = |file| Graph::open(&environment, &manifest::read(&folder, file)?, config.threads);
+        let open = |file| Graph::open(&loaded, &manifest::read(&folder, file)?, config);
         let (pyramid, decoder) = (open(&entry.pyramid)?, open(&entry.decoder)?);
         let features = features(&entry, &pyramid, &decoder)?;
         let mut assigned = provider::assigned(&pyramid.session).map_err(failed("name its providers"))?;
         for (name, count) in provider::assigned(&decoder.session).map_err(failed("name its providers"))? {
             *assigned.entry(name).or_insert(0) += count;
         }
+        provider::check(config, &assigned)?;
+        let library = loaded.1;
         let provider = format!("{} of ONNX Runtime {}", provider::named(&assigned), provider::version(&library));
         let sha256 = [entry.pyramid, entry.decoder].into_iter().map(|file| (file.file, file.sha256)).collect();
         Ok(Self {

@@ -26,6 +26,7 @@ mod obstacles;
 mod onnx_bytes;
 mod outliers;
 mod peers;
+mod providers;
 mod recording;
 mod recordings;
 mod refine;

@@ -20,7 +20,7 @@ use nightflow::{
     flow,
 };
 
-use crate::Exit;
+use crate::{Exit, launch};
 
 /// Judge methods on a data set with true flow: end-point error, outliers and angular error, by exposure.
 #[derive(clap::Args)]
@@ -115,6 +115,9 @@ struct How {
     /// Threads of the networks.
     #[arg(long, default_value_t = 2)]
     threads: usize,
+    /// A launch file whose [flow] says with what networks are computed: runtime, provider, precision, operators, models.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
 }
 
 fn kind(text: &str) -> Result<Kind, String> {
@@ -200,7 +203,7 @@ fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, Str
     if items.is_empty() && skipped.is_empty() {
         bail!("{} has no pair{}", folder.display(), how.only.as_ref().map_or(String::new(), |t| format!(" named {t}")));
     }
-    let config = flow::Config { threads: how.threads, ..flow::Config::default() };
+    let config = flow::Config { threads: how.threads, ..launch::read(how.config.as_deref())?.flow };
     let mut methods = how.models.iter().map(|given| Method::open(given, &config)).collect::<Result<Vec<_>, _>>()?;
     let enhancers = how.enhancers.iter().cloned().map(|by| Enhancing::open(by, &config));
     let mut enhancers = enhancers.collect::<Result<Vec<_>, _>>()?;
