@@ -1,8 +1,13 @@
 //! The loop: source, step, sinks; with stop, counters and the status once a second.
 
+mod governor;
+
 use std::{
     collections::BTreeMap,
-    sync::atomic::{AtomicBool, Ordering},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
     time::{Duration, Instant},
 };
 
@@ -16,6 +21,7 @@ use crate::{
     publish::{self, Moved, Offer, Sink, iceoryx2::SharedSink},
     wire,
 };
+pub use governor::{Governor, Narrowed, Taken};
 
 /// How long the loop waits for a sample before it looks at the stop flag again.
 const WAIT: Duration = Duration::from_millis(50);
@@ -140,6 +146,8 @@ pub struct Report {
     pub state: State,
     /// What camera and gyro disagree on.
     pub diagnosis: Option<Diagnosis>,
+    /// Images are narrower than the settings want, to keep the camera's rate.
+    pub narrowed: Option<Narrowed>,
     /// Of the newest step: the camera's noise, the raw mean, and the noise level in the network's image.
     pub noise: Option<(Noise, f32, f32)>,
 }
@@ -206,11 +214,10 @@ impl Report {
             State::Degraded(cause) => (1, cause.to_string()),
             State::Blind(cause) => (2, cause.to_string()),
         };
-        let (state, cause) = match &self.diagnosis {
-            Some(diagnosis) if cause.is_empty() => (state.max(1), diagnosis.to_string()),
-            Some(diagnosis) => (state, format!("{cause}; {diagnosis}")),
-            None => (state, cause),
-        };
+        let said = [self.diagnosis.as_ref().map(ToString::to_string), self.narrowed.as_ref().map(ToString::to_string)];
+        let (state, cause) = said.into_iter().flatten().fold((state, cause), |(state, cause), more| {
+            if cause.is_empty() { (state.max(1), more) } else { (state, format!("{cause}; {more}")) }
+        });
         let [noise_a, noise_b, snr_db, noise_level] = self.noise.map_or([f32::NAN; 4], |(noise, mean, level)| {
             [noise.a as f32, noise.b as f32, noise.snr_db(mean.into()) as f32, level]
         });
@@ -302,13 +309,14 @@ impl Reopening<'_> {
 }
 
 /// Runs until the source ends or `stop` is set, then writes everything out. `look` sees the report after every sample,
-/// with the progress through a finite source. Without a pipeline the samples are only kept.
+/// with the progress through a finite source. Without a pipeline the samples are only kept. A governor, where there is one,
+/// may narrow the images; what it decides is a sample like any other, so that it is recorded and replayed.
 pub fn drive(
     open: &mut dyn FnMut() -> Result<Box<dyn Source>, camera::Error>,
     mut pipeline: Option<&mut Pipeline>,
     outputs: &mut Outputs<'_>,
     stop: &AtomicBool,
-    silence: Duration,
+    (silence, mut governor): (Duration, Option<Governor>),
     look: &mut dyn FnMut(&Report, Option<f64>),
 ) -> Result<Report, Error> {
     let mut report = Report::default();
@@ -322,7 +330,10 @@ pub fn drive(
                 outputs.sample(&sample);
                 cadence.saw(&sample, &mut report);
                 if let Some(pipeline) = pipeline.as_deref_mut() {
-                    advance(&sample, pipeline, outputs, &mut report);
+                    let taken = advance(&sample, pipeline, outputs, &mut report);
+                    if let (Some(governor), Some(taken)) = (&mut governor, taken) {
+                        govern(governor, taken, source.counts().displaced, pipeline, outputs, &mut report);
+                    }
                 }
             }
             Ok(Next::Idle) => {}
@@ -348,8 +359,27 @@ pub fn drive(
     Ok(report)
 }
 
-/// One sample through the pipeline and out of every sink.
-fn advance(sample: &Sample, pipeline: &mut Pipeline, outputs: &mut Outputs<'_>, report: &mut Report) {
+/// Lets the governor look at a step, and does what it says.
+fn govern(
+    governor: &mut Governor,
+    taken: Taken,
+    displaced: u64,
+    pipeline: &mut Pipeline,
+    outputs: &mut Outputs<'_>,
+    report: &mut Report,
+) {
+    if let Some(columns) = governor.took(&Taken { displaced, ..taken }) {
+        let header = wire::Header { stamp: taken.stamp.into(), frame_id: String::new() };
+        let sample = Sample::Width(Arc::new(wire::Width { header, columns: columns as u32 }));
+        outputs.sample(&sample);
+        advance(&sample, pipeline, outputs, report);
+        tracing::info!(target: "nightflow::node", "images are developed {columns} columns wide from here on");
+    }
+    report.narrowed = governor.narrowed();
+}
+
+/// One sample through the pipeline and out of every sink; how a step went, where it was one.
+fn advance(sample: &Sample, pipeline: &mut Pipeline, outputs: &mut Outputs<'_>, report: &mut Report) -> Option<Taken> {
     let start = clock::instant();
     report.watch.start();
     match pipeline.step(sample, outputs.lender(), &mut report.watch) {
@@ -357,11 +387,15 @@ fn advance(sample: &Sample, pipeline: &mut Pipeline, outputs: &mut Outputs<'_>, 
             outputs.offer(&moved, pipeline);
             report.watch.lap(Stage::Publish);
             report.moved(&moved);
-            report.step_ms.keep(start.elapsed().as_secs_f64() * 1e3);
+            let step_s = start.elapsed().as_secs_f64();
+            report.step_ms.keep(step_s * 1e3);
             report.latency_ms.keep(clock::now().seconds_since(moved.newer) * 1e3);
+            let size = pipeline.image().map_or([1, 1], |image| [image.width, image.height]);
+            return Some(Taken { stamp: moved.newer, displaced: 0, step_s, size });
         }
         Ok(Outcome::Unpaired) => report.unpaired += 1,
         Ok(Outcome::Noted) => {}
         Err(error) => report.spoil(error.cause(), &error),
     }
+    None
 }

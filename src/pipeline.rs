@@ -102,6 +102,10 @@ impl Pipeline {
             Sample::Info(info) => Ok(self.motion.info(info).map(|()| Outcome::Noted)?),
             Sample::Imu(imu) => Ok(self.motion.imu(imu).map(|()| Outcome::Noted)?),
             Sample::Range(range) => Ok(self.motion.range(range).map(|()| Outcome::Noted)?),
+            Sample::Width(width) => {
+                self.exposure.set_width(width.columns as usize);
+                Ok(Outcome::Noted)
+            }
             Sample::Transforms(message) => Ok(self.motion.transforms(message).map(|()| Outcome::Noted)?),
         }
     }

@@ -141,7 +141,7 @@ pub fn look(
                 Sample::Imu(imu) => odometer.imu(imu).map_err(|error| say(&error))?,
                 Sample::Range(range) => odometer.range(range).map_err(|error| say(&error))?,
                 Sample::Info(info) => odometer.info(info).map_err(|error| say(&error))?,
-                Sample::Frame(_) | Sample::Transforms(_) => {}
+                Sample::Frame(_) | Sample::Transforms(_) | Sample::Width(_) => {}
             }
         }
         developer.develop(&flown.photograph(index, rung, camera)).map_err(|error| say(&error))?;

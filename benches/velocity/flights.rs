@@ -115,7 +115,7 @@ pub fn fly(plan: Plan) -> Result<Flown, String> {
                     frames
                         .push(frame.image.data.as_chunks::<2>().0.iter().map(|two| u16::from_le_bytes(*two)).collect());
                 }
-                Sample::Info(_) | Sample::Transforms(_) => {}
+                Sample::Info(_) | Sample::Transforms(_) | Sample::Width(_) => {}
             }
         }
         let flight::Truth { stamp, velocity, rates, height, flow } = shot.truth;

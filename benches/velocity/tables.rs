@@ -78,7 +78,7 @@ pub fn judge(sensors: &Sensors, seen: &Seen, config: &Config) -> Result<Vec<Row>
                 let taken = match sample {
                     Sample::Imu(imu) => odometer.imu(imu),
                     Sample::Range(range) => odometer.range(range),
-                    Sample::Info(_) | Sample::Frame(_) | Sample::Transforms(_) => Ok(()),
+                    Sample::Info(_) | Sample::Frame(_) | Sample::Transforms(_) | Sample::Width(_) => Ok(()),
                 };
                 taken.map_err(|error| error.to_string())?;
             }

@@ -40,6 +40,7 @@ enum Kind {
     Imu,
     Range,
     Transforms,
+    Width,
 }
 
 impl Kind {
@@ -50,6 +51,7 @@ impl Kind {
             Kind::Imu => "sensor_msgs/msg/Imu",
             Kind::Range => "sensor_msgs/msg/Range",
             Kind::Transforms => "tf2_msgs/msg/TFMessage",
+            Kind::Width => "nightflow_msgs/msg/Width",
         }
     }
 }
@@ -59,7 +61,7 @@ pub struct Recording {
     path: PathBuf,
     files: VecDeque<PathBuf>,
     open: Option<Messages<File>>,
-    topics: [(String, Kind); 5],
+    topics: [(String, Kind); 6],
     /// Channels of the open file whose kind was settled.
     settled: BTreeMap<u16, Option<Kind>>,
     /// Topics that were seen but not asked for.
@@ -94,6 +96,7 @@ impl Recording {
                 named(&config.imu_topic, Kind::Imu),
                 named(&config.range_topic, Kind::Range),
                 named(&config.tf_topic, Kind::Transforms),
+                named(&config.width_topic, Kind::Width),
             ],
             settled: BTreeMap::new(),
             others: Vec::new(),
@@ -220,6 +223,7 @@ fn decoded(kind: Kind, message: &Message<'_>, received: Stamp) -> Result<Sample,
         Kind::Imu => Sample::Imu(Arc::new(wire::decode(&message.data)?)),
         Kind::Range => Sample::Range(Arc::new(wire::decode(&message.data)?)),
         Kind::Transforms => Sample::Transforms(Arc::new(wire::decode(&message.data)?)),
+        Kind::Width => Sample::Width(Arc::new(wire::decode(&message.data)?)),
     })
 }
 
@@ -286,7 +290,10 @@ fn play(mut recording: Recording, sender: &Sender, stop: &AtomicBool, progress: 
                     }
                     std::thread::sleep(left.min(Duration::from_millis(50)));
                 }
-                sender.put(now_received(sample));
+                // What another run could keep up with says nothing about this one.
+                if !matches!(sample, Sample::Width(_)) {
+                    sender.put(now_received(sample));
+                }
             }
             Ok(None) => {
                 progress.store(1_f64.to_bits(), Ordering::Relaxed);

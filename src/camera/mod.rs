@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     clock::Stamp,
-    wire::{self, CameraInfo, Image, Imu, Range, TfMessage},
+    wire::{self, CameraInfo, Image, Imu, Range, TfMessage, Width},
 };
 
 /// A camera frame as it came: the mosaic is looked at by [`crate::exposure`] only.
@@ -43,6 +43,8 @@ pub enum Sample {
     Range(Arc<Range>),
     /// Where frames of reference stand in each other.
     Transforms(Arc<TfMessage>),
+    /// How wide images are developed from now on: the node's own decision, which a replay must know.
+    Width(Arc<Width>),
 }
 
 impl Sample {
@@ -53,6 +55,7 @@ impl Sample {
             Sample::Info(info) => info.header.stamp.into(),
             Sample::Imu(imu) => imu.header.stamp.into(),
             Sample::Range(range) => range.header.stamp.into(),
+            Sample::Width(width) => width.header.stamp.into(),
             Sample::Transforms(message) => {
                 message.transforms.iter().map(|one| one.header.stamp.into()).min().unwrap_or_default()
             }
@@ -141,6 +144,8 @@ pub struct Config {
     pub range_topic: String,
     /// Topic of the transforms, for `[motion] camera = "tf"`; empty reads none.
     pub tf_topic: String,
+    /// Topic of a recording on which the governor's widths are; see `[exposure] width_min`.
+    pub width_topic: String,
     /// A source is called lost after this time without a frame.
     pub silence_s_max: f64,
     /// How long an exposure lasts that begins at its frame's stamp.
@@ -164,6 +169,7 @@ impl Default for Config {
             imu_topic: "/imu/data_raw".into(),
             range_topic: "/range".into(),
             tf_topic: "/tf_static".into(),
+            width_topic: "/nightflow/width".into(),
             silence_s_max: 1.0,
             exposure_s: 0.0,
         }
@@ -177,6 +183,7 @@ pub const REASONS: &[(&str, &str)] = &[
     ("imu_topic", "REP 145: what the sensor measured, with no orientation mixed in"),
     ("range_topic", "no convention exists; set it to the range finder's"),
     ("tf_topic", "where robot_state_publisher says how sensors sit; a camera on a moving gimbal is told on /tf"),
+    ("width_topic", "beside the node's other results; only replays read it"),
     ("silence_s_max", "1: thirty frames of a 30 Hz camera, and soon enough for a pilot"),
     (
         "exposure_s",

@@ -25,6 +25,8 @@ struct Kept {
 #[derive(Debug)]
 pub struct Developer {
     config: Config,
+    /// Columns of the next image at most.
+    width: usize,
     law: Law,
     /// Which of the next two hold a frame: none, the newer, or both.
     kept: usize,
@@ -45,6 +47,7 @@ impl Developer {
         config.check()?;
         Ok(Self {
             config: config.clone(),
+            width: config.width_max,
             law: Law::new(config),
             kept: 0,
             newer: Kept::default(),
@@ -95,6 +98,13 @@ impl Developer {
         self.step = None;
     }
 
+    /// Develops what comes to at most so many columns, within the settings' bounds. Where that changes the size, the next
+    /// frame finds no partner, for unlike images are no pair.
+    pub fn set_width(&mut self, columns: usize) {
+        self.width =
+            columns.clamp(self.config.width_min.unwrap_or(1).min(self.config.width_max), self.config.width_max);
+    }
+
     /// The newest developed frame, if it was not forgotten.
     pub fn newest(&self) -> Option<&Exposed> {
         (self.kept > 0).then_some(&self.newer.exposed)
@@ -102,7 +112,7 @@ impl Developer {
 
     /// Reduces the image into the spare frame and holds what it finds against what is declared.
     fn reduce(&mut self, layout: &Layout, image: &Image) -> Result<(), Error> {
-        let plan = Plan::new(layout, self.config.width_max);
+        let plan = Plan::new(layout, self.width);
         let mut reducer = match self.reducer.take() {
             Some((_, reducer)) if reducer.plan == plan => reducer,
             _ => Reducer::new(layout, plan),

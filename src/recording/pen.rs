@@ -23,6 +23,7 @@ pub(super) struct Topics {
     imu: String,
     range: String,
     transforms: String,
+    width: String,
     step: String,
     ego_motion: String,
     velocity: String,
@@ -41,6 +42,7 @@ impl Topics {
             imu: cameras.imu_topic.clone(),
             range: cameras.range_topic.clone(),
             transforms: cameras.tf_topic.clone(),
+            width: cameras.width_topic.clone(),
             step: under("step"),
             ego_motion: under("ego_motion"),
             velocity: under("velocity"),
@@ -96,6 +98,7 @@ impl Pen {
             Sample::Imu(imu) => put(writer, &self.topics.imu, lost, time, stamp, &**imu),
             Sample::Range(range) => put(writer, &self.topics.range, lost, time, stamp, &**range),
             Sample::Transforms(message) => put(writer, &self.topics.transforms, lost, time, stamp, &**message),
+            Sample::Width(width) => put(writer, &self.topics.width, lost, time, stamp, &**width),
         }
     }
 

@@ -68,6 +68,7 @@ impl Item {
             Item::Step(_) => 4,
             Item::Status(_) => 5,
             Item::Sample(Sample::Transforms(_)) => 6,
+            Item::Sample(Sample::Width(_)) => 7,
         }
     }
 }
@@ -84,7 +85,7 @@ pub(super) struct Popped {
 struct Waiting {
     items: VecDeque<(Item, u32)>,
     large: usize,
-    lost: [u32; 7],
+    lost: [u32; 8],
     // They travel in items as boxes; unboxing them here would only copy them.
     #[allow(clippy::vec_box)]
     spare: Vec<Box<StepItem>>,

@@ -21,7 +21,7 @@ pub use geometry::{
     Quaternion, Transform, TransformStamped, Twist, TwistStamped, TwistWithCovariance, TwistWithCovarianceStamped,
     Vector3, Vector3Stamped,
 };
-pub use nightflow::{EgoMotion, Status, Step};
+pub use nightflow::{EgoMotion, Status, Step, Width};
 pub use px4::{ObstacleDistance, SensorOpticalFlow, VehicleOpticalFlow};
 pub use sensor::{CameraInfo, CompressedImage, Image, Imu, LaserScan, Range, RegionOfInterest};
 pub use standard::{Header, Time};
@@ -141,8 +141,8 @@ macro_rules! texts {
     };
 }
 
-const TEXTS: [(&str, &str); 28] = texts! {
-    "" "nightflow_msgs": "EgoMotion" "Status" "Step";
+const TEXTS: [(&str, &str); 29] = texts! {
+    "" "nightflow_msgs": "EgoMotion" "Status" "Step" "Width";
     "px4_msgs/" "px4_msgs": "ObstacleDistance" "SensorOpticalFlow" "VehicleOpticalFlow";
     "standard/builtin_interfaces/" "builtin_interfaces": "Time";
     "standard/diagnostic_msgs/" "diagnostic_msgs": "DiagnosticArray" "DiagnosticStatus" "KeyValue";

@@ -75,3 +75,16 @@ impl Message for Status {
     const PACKAGE: &'static str = "nightflow_msgs";
     const NAME: &'static str = "Status";
 }
+
+/// `nightflow_msgs/Width`: how wide images are developed from now on.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[allow(missing_docs)]
+pub struct Width {
+    pub header: Header,
+    pub columns: u32,
+}
+
+impl Message for Width {
+    const PACKAGE: &'static str = "nightflow_msgs";
+    const NAME: &'static str = "Width";
+}

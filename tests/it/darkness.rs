@@ -266,7 +266,7 @@ fn a_synthetic_flight_comes_out_right() {
                 Sample::Imu(imu) => odometer.imu(imu).unwrap(),
                 Sample::Range(range) => odometer.range(range).unwrap(),
                 Sample::Info(info) => odometer.info(info).unwrap(),
-                Sample::Frame(_) | Sample::Transforms(_) => {}
+                Sample::Frame(_) | Sample::Transforms(_) | Sample::Width(_) => {}
             }
         }
         let Some(truth) = shot.truth.flow else { continue };

@@ -16,6 +16,7 @@ use nightflow::{
     node::{self, Outputs},
     pipeline::{Outcome, Pipeline},
     recording::{self, Definition, Writer},
+    wire,
 };
 
 use crate::bags;
@@ -68,7 +69,7 @@ fn driven(script: Vec<Result<Sample, camera::Error>>) -> node::Report {
     let stop = AtomicBool::new(false);
     let mut pipeline = faked();
     let second = Duration::from_secs(1);
-    node::drive(&mut open, Some(&mut pipeline), &mut Outputs::default(), &stop, second, &mut |_, _| {}).unwrap()
+    node::drive(&mut open, Some(&mut pipeline), &mut Outputs::default(), &stop, (second, None), &mut |_, _| {}).unwrap()
 }
 
 #[test]
@@ -155,7 +156,8 @@ fn a_lost_source_is_opened_again() {
     let mut pipeline = faked();
     let second = Duration::from_secs(1);
     let report =
-        node::drive(&mut open, Some(&mut pipeline), &mut Outputs::default(), &stop, second, &mut |_, _| {}).unwrap();
+        node::drive(&mut open, Some(&mut pipeline), &mut Outputs::default(), &stop, (second, None), &mut |_, _| {})
+            .unwrap();
     assert_eq!((report.frames, report.steps), (4, 3));
     assert_eq!(opened, 2);
 }
@@ -246,6 +248,37 @@ fn the_printed_configuration_is_a_configuration() {
     assert_eq!(printed.status.code(), Some(0));
     let whole = String::from_utf8(printed.stdout).unwrap();
     assert_eq!(Config::parse(&whole, Path::new("printed")).unwrap(), Config::default());
+}
+
+#[test]
+fn a_width_that_the_governor_chose_is_replayed() {
+    let folder = tempfile::tempdir().unwrap();
+    let (bag, bag_text) = path(folder.path(), "in.mcap");
+    let (_, out) = path(folder.path(), "out.mcap");
+    let mut writer = Writer::create(&bag, &recording::Config::default()).unwrap();
+    let known = [("config".to_owned(), bags::SETTINGS.to_owned())].into();
+    writer.attach_metadata("nightflow", &known).unwrap();
+    for index in 0..6 {
+        let frame = bags::frame(index);
+        let stamp = frame.stamp();
+        writer.write("/camera/image_raw", frame.received, stamp, &frame.image).unwrap();
+        // The last one asks for more than the settings allow.
+        for (_, columns) in [(2, 128), (4, 5000)].into_iter().filter(|(after, _)| *after == index) {
+            let header = wire::Header { stamp: stamp.into(), frame_id: String::new() };
+            writer.write("/nightflow/width", stamp, stamp, &wire::Width { header, columns }).unwrap();
+        }
+    }
+    writer.finish().unwrap();
+    let run = nightflow(&["replay", &bag_text, "--out", &out]);
+    assert_eq!(run.status.code(), Some(0), "{}", text(&run));
+    let steps = recording::Outputs::open(Path::new(&out), "/nightflow").unwrap();
+    let steps = steps.filter(|output| output.topic == "/nightflow/step");
+    let widths: Vec<u32> = steps.map(|output| wire::decode::<wire::Step>(&output.cdr).unwrap().width).collect();
+    // 320 camera columns are 160 cells of the mosaic, and one vector stands for four; the frame after a change has no partner.
+    assert_eq!(widths, [40, 40, 32]);
+    let check = nightflow(&["replay", &out, "--check"]);
+    assert_eq!(check.status.code(), Some(0), "{}", text(&check));
+    assert!(text(&check).contains("equal to the byte"), "{}", text(&check));
 }
 
 #[test]

@@ -8,7 +8,7 @@ use nightflow::wire::{
     self, CameraInfo, CompressedImage, Definitions, DiagnosticArray, DiagnosticStatus, EgoMotion, Header, Image, Imu,
     KeyValue, LaserScan, Message, ObstacleDistance, Quaternion, Range, RegionOfInterest, SensorOpticalFlow, Status,
     Step, TfMessage, Time, Transform, TransformStamped, Twist, TwistStamped, TwistWithCovariance,
-    TwistWithCovarianceStamped, Vector3, Vector3Stamped, VehicleOpticalFlow,
+    TwistWithCovarianceStamped, Vector3, Vector3Stamped, VehicleOpticalFlow, Width,
     definition::{Base, Count, Definition},
 };
 use proptest::{prelude::*, strategy::ValueTree, test_runner::TestRunner};
@@ -22,7 +22,7 @@ macro_rules! for_every_message {
         for_every_message!(@each $check ($($argument),*)
             Time, Header, Image, CompressedImage, CameraInfo, RegionOfInterest, Imu, Range, LaserScan, Vector3,
             Vector3Stamped, Quaternion, Twist, TwistStamped, TwistWithCovariance, TwistWithCovarianceStamped, KeyValue,
-            DiagnosticStatus, DiagnosticArray, Step, EgoMotion, Status, SensorOpticalFlow, VehicleOpticalFlow,
+            DiagnosticStatus, DiagnosticArray, Step, EgoMotion, Status, Width, SensorOpticalFlow, VehicleOpticalFlow,
             ObstacleDistance, Transform, TransformStamped, TfMessage)
     };
     (@each $check:ident $arguments:tt $($message:ty),*) => { $(for_every_message!(@one $check $arguments $message);)* };

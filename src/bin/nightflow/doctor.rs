@@ -194,7 +194,7 @@ fn camera(config: &Config, wait_s: f64) -> Finding {
             Ok(Next::Sample(Sample::Imu(_))) => _ = beside.insert("gyro"),
             Ok(Next::Sample(Sample::Range(_))) => _ = beside.insert("range"),
             Ok(Next::Sample(Sample::Transforms(_))) => _ = beside.insert("transforms"),
-            Ok(Next::Idle) => {}
+            Ok(Next::Sample(Sample::Width(_)) | Next::Idle) => {}
             Ok(Next::End) => break,
             Err(error) => return Finding::Do(error.to_string()),
         }

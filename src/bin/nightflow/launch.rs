@@ -13,7 +13,7 @@ use nightflow::{
     camera,
     config::Config,
     flow::Matcher,
-    node::{self, Outputs, Report},
+    node::{self, Governor, Outputs, Report},
     pipeline::Pipeline,
     publish::{self, iceoryx2::SharedSink},
     recording::{self, Recorder},
@@ -54,12 +54,14 @@ pub fn drive(
     finite: bool,
 ) -> Result<Report> {
     let bar = progress(finite)?;
+    // A source that waits for us has no rate to keep, and its recording says how wide images were.
+    let governor = (!config.camera.waits()).then(|| Governor::new(&config.exposure)).flatten();
     let report = node::drive(
         &mut || camera::open(&config.camera),
         pipeline,
         outputs,
         stop,
-        Duration::from_secs_f64(config.camera.silence_s_max),
+        (Duration::from_secs_f64(config.camera.silence_s_max), governor),
         &mut |report, progress| advance(&bar, report, progress),
     );
     bar.finish_and_clear();

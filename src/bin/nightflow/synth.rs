@@ -162,6 +162,7 @@ fn keep(out: &mut Writer, sample: &Sample) -> Result<()> {
         Sample::Info(info) => out.write("/camera/camera_info", stamp, stamp, info.as_ref())?,
         Sample::Imu(imu) => out.write("/imu/data_raw", stamp, stamp, imu.as_ref())?,
         Sample::Range(range) => out.write("/range", stamp, stamp, range.as_ref())?,
+        Sample::Width(width) => out.write("/nightflow/width", stamp, stamp, width.as_ref())?,
         Sample::Transforms(message) => out.write("/tf_static", stamp, stamp, message.as_ref())?,
     }
     Ok(())
