@@ -17,10 +17,12 @@ const SHARE_MAX: f64 = 0.95;
 const SHARE_FITTING: f64 = 0.85;
 /// A wider width must have fitted into this for as long as patience lasts.
 const SHARE_WIDER: f64 = 0.75;
-/// Weight of the newest step in the smoothed share: ten steps.
+/// Weight of the newest step in the smoothed share: ten steps, and all of them while there are fewer.
 const SMOOTHING: f64 = 0.1;
-/// After a change the share settles for this many steps before it is believed; the first takes memory.
-const SETTLING: u32 = 15;
+/// After a change the share is believed after this many steps, of which the first takes memory and does not count, …
+const SETTLING: u32 = 5;
+/// … and after this long, seconds.
+const SETTLING_S: f64 = 0.5;
 /// Patience before widening, seconds, at first and at most.
 const PATIENCE_S: [f64; 2] = [5.0, 80.0];
 /// A narrowing so soon after a widening says that the widening was wrong, seconds.
@@ -39,6 +41,7 @@ pub struct Governor {
     period_s: Option<f64>,
     step_s: Option<f64>,
     settled: u32,
+    settled_s: f64,
     fitted_s: f64,
     since_widened_s: f64,
     patience_s: f64,
@@ -89,6 +92,7 @@ impl Governor {
             period_s: None,
             step_s: None,
             settled: 0,
+            settled_s: 0.0,
             fitted_s: 0.0,
             since_widened_s: f64::INFINITY,
             patience_s: PATIENCE_S[0],
@@ -104,19 +108,20 @@ impl Governor {
             return None;
         }
         let frames = 1 + taken.displaced.saturating_sub(displaced);
-        let smooth = |kept: &mut Option<f64>, new: f64| {
-            let value = kept.map_or(new, |kept| kept + SMOOTHING * (new - kept));
+        let smooth = |kept: &mut Option<f64>, new: f64, weight: f64| {
+            let value = kept.map_or(new, |kept| kept + weight * (new - kept));
             *kept = Some(value);
             value
         };
-        let period_s = smooth(&mut self.period_s, passed_s / frames as f64);
+        let period_s = smooth(&mut self.period_s, passed_s / frames as f64, SMOOTHING);
         self.since_widened_s += passed_s;
+        self.settled_s += passed_s;
         self.settled += 1;
         if self.settled == 1 {
             return None;
         }
-        let step_s = smooth(&mut self.step_s, taken.step_s);
-        if self.settled < SETTLING {
+        let step_s = smooth(&mut self.step_s, taken.step_s, SMOOTHING.max(1.0 / f64::from(self.settled - 1)));
+        if self.settled < SETTLING || self.settled_s < SETTLING_S {
             return None;
         }
         let share = |width: usize| step_s / period_s * area(width, taken.size) / area(self.widths[self.at], taken.size);
@@ -143,7 +148,8 @@ impl Governor {
     }
 
     fn change(&mut self, to: usize) -> usize {
-        (self.at, self.step_s, self.settled, self.fitted_s) = (to, None, 0, 0.0);
+        (self.at, self.step_s, self.fitted_s) = (to, None, 0.0);
+        (self.settled, self.settled_s) = (0, 0.0);
         self.widths[to]
     }
 
