@@ -184,6 +184,18 @@ impl<'a> Bench<'a> {
         if fused { Operators::Fused } else { Operators::Plain }
     }
 
+    /// Where in a round somebody's turn is: by network, refined before unrefined, fused, plain, then who is no network.
+    fn place(&self, what: &What) -> (usize, usize) {
+        let of = |network: &str| self.networks.iter().position(|(name, _)| name == network).unwrap_or(usize::MAX);
+        match what {
+            What::Refined(network) => (of(network), 0),
+            What::Step(network, Operators::Fused) => (of(network), 1),
+            What::Step(network, Operators::Plain) => (of(network), 2),
+            What::OpenVino(network, _) => (of(network), 3),
+            What::Sized(..) | What::Product | What::OpenCv(_) => (usize::MAX, 0),
+        }
+    }
+
     /// Every network, what refining adds, the product of matrices and the rivals, all in turns.
     fn steps(&self, report: &mut Report) -> Result<()> {
         let (Size(size @ [width, height]), threads) = (self.args.size, self.threads);
@@ -209,6 +221,8 @@ impl<'a> Bench<'a> {
             (false, _) => Rivals::default(),
         };
         turns.append(&mut rivals.turns);
+        // What is compared most goes side by side.
+        turns.sort_by_key(|turn| self.place(&turn.what));
         let bar = progress(turns.len(), self.args.rounds.into(), "the step")?;
         report.steps = mended(turns::take(&mut turns, self.args.rounds.into(), &bar), &mut rivals.left_out)?;
         bar.finish_and_clear();
