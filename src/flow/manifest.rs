@@ -1,6 +1,7 @@
 //! `models/manifest.toml`: which files make a network, and what they must be to the byte.
 
 use std::{
+    collections::BTreeMap,
     fs,
     path::{Path, PathBuf},
 };
@@ -26,6 +27,8 @@ pub struct Entry {
     pub decoder: File,
     /// The same decoder with the operators of [`crate::flow::cost_volume`], if there is one.
     pub fused: Option<File>,
+    /// Multiply-adds of all convolutions of a step, pyramid and decoder, at 320 × 256, in 10⁹; they grow with the area.
+    pub gigamacs: Option<f64>,
     /// Fewer bits than 32 in which its end-point error was measured to stay within 2 % down the brightness ladder.
     #[serde(default)]
     pub precisions: Vec<Precision>,
@@ -64,17 +67,34 @@ pub fn folder(set: &Path, executable: Option<&Path>) -> PathBuf {
     }
 }
 
-/// The manifest's entry for `network`.
+/// Every network of the manifest by its name.
+pub fn entries(folder: &Path) -> Result<BTreeMap<String, Entry>, Error> {
+    let (path, table) = table(folder)?;
+    let entry = |(name, value): (String, toml::Value)| match value.try_into() {
+        Ok(entry) => Ok((name, entry)),
+        Err(e) => Err(Error::Manifest { path: path.clone(), reason: format!("[{name}] {e}") }),
+    };
+    table.into_iter().map(entry).collect()
+}
+
+/// The manifest's entry for `network`. The others may be of a later version.
 pub fn entry(folder: &Path, network: &str) -> Result<Entry, Error> {
-    let path = folder.join("manifest.toml");
+    let (path, mut table) = table(folder)?;
     let wrong = |reason: String| Error::Manifest { path: path.clone(), reason };
-    let text =
-        fs::read_to_string(&path).map_err(|e| wrong(format!("{e}; set [flow] models to the folder of the models")))?;
-    let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| wrong(e.to_string()))?;
     let names = table.keys().cloned().collect::<Vec<_>>().join(", ");
     let entry =
         table.remove(network).ok_or_else(|| wrong(format!("network {network} is not in it, it has {names}")))?;
     entry.try_into().map_err(|e: toml::de::Error| wrong(format!("[{network}] {e}")))
+}
+
+/// The manifest and where it lies.
+fn table(folder: &Path) -> Result<(PathBuf, toml::Table), Error> {
+    let path = folder.join("manifest.toml");
+    let wrong = |reason: String| Error::Manifest { path: path.clone(), reason };
+    let text =
+        fs::read_to_string(&path).map_err(|e| wrong(format!("{e}; set [flow] models to the folder of the models")))?;
+    let table = text.parse().map_err(|e: toml::de::Error| wrong(e.to_string()))?;
+    Ok((path, table))
 }
 
 /// The bytes of a file, which are what the manifest says.

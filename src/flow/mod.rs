@@ -5,7 +5,7 @@ pub mod cost_volume;
 mod error;
 mod fake;
 mod golden;
-mod manifest;
+pub mod manifest;
 mod matcher;
 mod network;
 mod onnx;

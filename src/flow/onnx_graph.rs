@@ -22,8 +22,13 @@ pub struct Graph {
 impl Graph {
     /// Loads `path` with the runtime and the threads of the settings; it must have this many inputs.
     pub fn open(config: &Config, path: &Path, inputs: usize) -> Result<Self, Error> {
-        let (environment, _) = environment(config)?;
         let bytes = std::fs::read(path).map_err(|e| Error::Manifest { path: path.into(), reason: e.to_string() })?;
+        Self::of(config, path.display().to_string(), &bytes, inputs)
+    }
+
+    /// The same of a graph's bytes, which are called `file` in errors.
+    pub fn of(config: &Config, file: String, bytes: &[u8], inputs: usize) -> Result<Self, Error> {
+        let (environment, _) = environment(config)?;
         let doing = "set up a session";
         let session = Session::builder(&environment)
             .map_err(failed(doing))?
@@ -32,9 +37,11 @@ impl Graph {
             .with_deterministic_compute(true)
             .map_err(failed(doing))?
             .with_optimization_level(GraphOptimizationLevel::All)
+            .map_err(failed(doing))?
+            // Threads that spin after a run would take the cores from whatever comes next.
+            .with_config_entry("session.force_spinning_stop", "1")
             .map_err(failed(doing))?;
-        let session = load(session, &bytes)?;
-        let file = path.display().to_string();
+        let session = load(session, bytes)?;
         let found: Vec<String> = session.inputs().iter().map(|outlet| outlet.name().to_owned()).collect();
         if found.len() != inputs {
             let wanted = format!("{inputs} input{} of images, NCHW", if inputs == 1 { "" } else { "s" });

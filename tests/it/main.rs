@@ -5,6 +5,7 @@ mod allocations;
 mod autopilots;
 mod avoid;
 mod bags;
+mod bench;
 mod darkness;
 mod eval;
 mod exposure;

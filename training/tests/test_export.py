@@ -9,8 +9,8 @@ import onnx
 import pytest
 import torch
 
-from export import (GOLDEN_COLUMNS, GOLDEN_ROWS, OPSET, Exported, golden_frames, graphs_of, manifest_entry, moved,
-                    parity, rounded, write_manifest)
+from export import (GOLDEN_COLUMNS, GOLDEN_ROWS, OPSET, Exported, gigamacs, golden_frames, graphs_of, manifest_entry,
+                    moved, parity, rounded, write_manifest)
 from networks import PwcNet
 from raft import RaftSmall
 
@@ -111,6 +111,7 @@ def test_committed_files_are_those_of_the_manifest():
         for part, path in paths.items():
             assert hashlib.sha256(path.read_bytes()).hexdigest() == entry[part]["sha256"]
             assert path.stat().st_size <= 20_000_000
+        assert abs(entry["gigamacs"] - gigamacs(paths["pyramid"], paths["decoder"])) < 1e-3
         outputs = Exported(str(paths["pyramid"]), str(paths["decoder"]))(*golden_frames())
         rows, columns = np.ix_(GOLDEN_ROWS, GOLDEN_COLUMNS)
         for key, output in zip(("flow", "uncertainty"), outputs):

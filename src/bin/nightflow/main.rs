@@ -1,6 +1,7 @@
 //! The door: parses the command line and hands over to one file a subcommand.
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used))]
 
+mod bench;
 mod config;
 mod doctor;
 mod eval;
@@ -54,6 +55,8 @@ enum Command {
     Run(run::Args),
     /// Keep a source's samples in an MCAP file; no network runs.
     Record(record::Args),
+    /// Time the networks on this machine, beside rivals and beside what its processor can do.
+    Bench(bench::Args),
     /// Look at a running node from outside, through its shared memory.
     Watch(watch::Args),
     /// Say whether this machine is ready: runtime, model, memory, sockets, camera.
@@ -91,6 +94,7 @@ fn main() -> ExitCode {
         Command::Replay(args) => replay::run(args),
         Command::Run(args) => run::run(args),
         Command::Record(args) => record::run(args),
+        Command::Bench(args) => bench::run(&args),
         Command::Watch(args) => watch::run(args).map(|()| Exit::Done),
         Command::Doctor(args) => doctor::run(args),
         Command::Config(args) => config::run(args),
@@ -114,6 +118,7 @@ fn main() -> ExitCode {
 fn users_mistake(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| {
         cause.is::<ConfigError>()
+            || cause.is::<bench::Mistake>()
             || matches!(
                 cause.downcast_ref(),
                 Some(flow_files::Error::Content { .. } | flow_files::Error::Ending { .. })

@@ -1,0 +1,115 @@
+//! Our own step, and what the processor can do at best by the same library.
+
+use std::rc::Rc;
+
+use anyhow::{Result, ensure};
+use nightflow::{
+    clock::{self, Stamp},
+    exposure::{Exposed, Pair},
+    flow::{Config, Graph, Matcher, Own},
+};
+
+/// Frames that take turns: three would do for each to be new to the matcher, which keeps two.
+const FRAMES: u64 = 4;
+
+/// Images of networks have sides that are multiples of this.
+const STRIDE: usize = 64;
+
+/// Frames of a moving pattern; `benches/rivals/step.py` makes the same.
+pub fn frames(width: usize, height: usize) -> Rc<[Exposed]> {
+    (0..FRAMES).map(|number| frame(width, height, number)).collect()
+}
+
+fn frame(width: usize, height: usize, number: u64) -> Exposed {
+    let value = |i: usize| {
+        let (x, y) = ((i % width) as f32 + 2.0 * number as f32, (i / width % height) as f32 + number as f32);
+        0.4 + 0.2 * (0.31 * x + 0.17 * y).sin() * (0.23 * y - 0.11 * x).cos() + 0.1 * (0.9 * x).sin() * (0.7 * y).sin()
+    };
+    Exposed {
+        stamp: Stamp::from_ns(number as i64 * 33_000_000),
+        width,
+        height,
+        scale: [4.0, 4.0],
+        rgb: (0..3 * width * height).map(value).collect(),
+        saturated: vec![0; width * height],
+        raw_mean: 0.1,
+        gain: 4.0,
+        generation: number + 1,
+        ..Exposed::default()
+    }
+}
+
+/// What the image becomes for the network.
+pub fn padded(width: usize, height: usize) -> [usize; 2] {
+    [width, height].map(|side| side.next_multiple_of(STRIDE))
+}
+
+/// A matcher that gets one new frame a step, as in the node: the pyramid runs once and the decoder once.
+pub struct Ours {
+    matcher: Matcher,
+    frames: Rc<[Exposed]>,
+    own: Own,
+    steps: usize,
+}
+
+impl Ours {
+    pub fn open(config: &Config, frames: Rc<[Exposed]>) -> Result<Self> {
+        Ok(Self { matcher: Matcher::open(config)?, frames, own: Own::default(), steps: 0 })
+    }
+
+    /// What computes it, with its version.
+    pub fn provider(&self) -> &str {
+        &self.matcher.model().provider
+    }
+
+    /// Milliseconds of the step to the next frame.
+    pub fn step(&mut self) -> Result<f64> {
+        let of = |number: usize| &self.frames[number % self.frames.len()];
+        let (older, newer) = (of(self.steps), of(self.steps + 1));
+        let described = self.matcher.counts().described;
+        let start = clock::instant();
+        self.matcher.between(&Pair { older, newer, gain_step: None }, &mut self.own)?;
+        let ms = start.elapsed().as_secs_f64() * 1e3;
+        // The very first step knows no frame yet.
+        let looked_at = self.matcher.counts().described - described;
+        ensure!(looked_at == 1 || self.steps == 0, "a step looked at {looked_at} frames, expected 1");
+        self.steps += 1;
+        Ok(ms)
+    }
+}
+
+/// Rows and columns of the matrices.
+const SIDE: usize = 768;
+/// How many pairs of them.
+const PAIRS: usize = 3;
+
+/// An ONNX graph of operator set 9, in which a slice has its ends as attributes: `c = MatMul(a, b)`, all three [1, 3, n, n],
+/// and `row = Slice(c)`, of axis 2 from 0 to 1, so that next to nothing is fetched from it.
+const PRODUCT: &[u8] = b"\x08\x04\x12\x00:\xb4\x01\n\x11\n\x01a\n\x01b\x12\x01c\"\x06MatMul\n8\n\x01c\x12\x03row\"\x05Slice\
+    *\x0b\n\x04axes@\x02\xa0\x01\x07*\x0b\n\x04ends@\x01\xa0\x01\x07*\r\n\x06starts@\x00\xa0\x01\x07\x12\x07product\
+    Z\x1d\n\x01a\x12\x18\n\x16\x08\x01\x12\x12\n\x02\x08\x01\n\x02\x08\x03\n\x03\x12\x01n\n\x03\x12\x01n\
+    Z\x1d\n\x01b\x12\x18\n\x16\x08\x01\x12\x12\n\x02\x08\x01\n\x02\x08\x03\n\x03\x12\x01n\n\x03\x12\x01n\
+    b\x1e\n\x03row\x12\x17\n\x15\x08\x01\x12\x11\n\x02\x08\x01\n\x02\x08\x03\n\x02\x08\x01\n\x03\x12\x01nB\x04\n\x00\x10\t";
+
+/// Products of matrices of floats, which a processor is never faster at than at these.
+pub struct Product {
+    graph: Graph,
+    matrix: Vec<f32>,
+}
+
+impl Product {
+    /// Multiply-adds of a step, in 10⁹.
+    pub const GIGAMACS: f64 = (PAIRS * SIDE * SIDE * SIDE) as f64 * 1e-9;
+
+    pub fn open(config: &Config) -> Result<Self> {
+        let graph = Graph::of(config, "the product of matrices".into(), PRODUCT, 2)?;
+        let matrix = (0..PAIRS * SIDE * SIDE).map(|i| (i as f32 * 0.37).sin()).collect();
+        Ok(Self { graph, matrix })
+    }
+
+    pub fn step(&mut self) -> Result<f64> {
+        let start = clock::instant();
+        self.graph.run(&[&self.matrix, &self.matrix], SIDE, SIDE)?;
+        Ok(start.elapsed().as_secs_f64() * 1e3)
+    }
+}
