@@ -143,19 +143,20 @@ pub fn table(course: &str, rows: &[Row], method: usize, variant: usize) -> Strin
             continue;
         }
         let rates = rates(of(), SURE);
+        let percent = |part: f64| if part.is_nan() { "–".into() } else { format!("{:.1} %", 100.0 * part) };
         let part = |count: usize, all: usize| count as f64 / all.max(1) as f64;
         let (median, upper, _) = errors(of());
         let missed = part(of().filter(|row| row.due() && row.freed()).count(), rates.due);
         let freed = part(of().filter(|row| row.clear && row.freed()).count(), rates.clear);
         let _ = writeln!(
             out,
-            "| Exp-{rung} | {} | {:.3} | {missed:.3} | {} | {:.4} | {freed:.3} | {:.1} % | {:.1} % |",
+            "| Exp-{rung} | {} | {:.3} | {missed:.3} | {} | {:.4} | {freed:.3} | {} | {} |",
             rates.due,
             rates.detected,
             rates.clear,
             rates.alarmed,
-            100.0 * median,
-            100.0 * upper
+            percent(median),
+            percent(upper)
         );
     }
     out
