@@ -21,6 +21,9 @@ const PART: f64 = 0.01;
 /// Squared pixels that they may differ by in any case.
 const SLACK: f64 = 0.5;
 
+/// Of a smaller part nothing is made: where there is nothing to see, some vectors come back by chance, about one of a thousand.
+pub const VALID_MIN: f64 = 0.1;
+
 /// What two flows agree on.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Checked {

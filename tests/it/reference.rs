@@ -146,7 +146,7 @@ fn exposures_share_the_reference_of_their_brightest() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).display().to_string();
     let (mine, other) = (folder.path().join("mine"), folder.path().join("other/none"));
-    for name in ["01020301", "01020304", "01020309", "01030401", "01030402", "02010205", "02030401"] {
+    for name in ["01020301", "01020304", "01020309", "01030401", "01030402", "02010205", "02030401", "03010201"] {
         save(&mine, name, &frames());
     }
     // One exposure lacks a partner, another scene's brightest is torn, and of one scene there is no flow.
@@ -158,14 +158,23 @@ fn exposures_share_the_reference_of_their_brightest() {
         flow_files::write(&place.join(format!("{name}_flow.flo")), &moving(true)).unwrap();
         flow_files::write(&place.join(format!("{name}_back_flow.flo")), &moving(false)).unwrap();
     }
+    // Of another one hardly a vector comes back: nine columns that stand.
+    let odd = field(SIZE[0], SIZE[1], |x, _| if x < 9 { [0.0; 2] } else { [12.0, 0.0] });
+    flow_files::write(&other.join("exposure_1/03010201_flow.flo"), &odd).unwrap();
+    let still = field(SIZE[0], SIZE[1], |_, _| [0.0; 2]);
+    flow_files::write(&other.join("exposure_1/03010201_back_flow.flo"), &still).unwrap();
     // One scene has a truth, which the reference is compared with.
     flow_files::write(&mine.join("02010205_flow.flo"), &moving(true)).unwrap();
     let model = format!("other={}", path("other"));
     let made = nightflow(&["eval", "reference", &path("mine"), "--model", &model, "--out", &path("judged")]);
     let text = said(&made);
     assert_eq!(made.status.code(), Some(3), "{text}");
-    assert!(text.contains("Left out: 3") && text.contains("there is no 01020309_img2.*"), "{text}");
+    assert!(text.contains("Left out: 4") && text.contains("there is no 01020309_img2.*"), "{text}");
     assert!(text.contains("- 01030401: ") && text.contains("02030401_flow.flo"), "{text}");
+    assert!(
+        text.contains("- 03010201: expected 10 % of its vectors to come back") && text.contains("found 4.7 %"),
+        "{text}"
+    );
     assert!(text.contains("| 01020301 | 2 | 96.9 | 0.00 | 0.000 | – | – | – |"), "{text}");
     assert!(
         text.contains("| 01030402 | 1 |") && text.contains("| 02010205 | 1 | 96.9 | 0.00 | 0.000 | 0.000 | 0.000 |")

@@ -27,19 +27,27 @@ const PICTURES: &str = "pictures";
 #[derive(clap::Args)]
 #[command(after_help = "\
 Examples:
-  nightflow eval reference mine/ --out judged                    (CCPPQQEE_img1.*, _img2.*: linear, as VBOF's are)
-  nightflow eval judged --models pwcnet_fcdn,zero                (every exposure against its scene's reference)
-  nightflow eval reference photos/ --linear --out judged         (NAME_img1.jpg, NAME_img2.jpg: sRGB pictures)
-  nightflow eval ladder judged --models pwcnet_fcdn,zero         (the same pairs photographed ever darker)
+  nightflow eval reference mine/ --out judged              (CCPPQQEE_img1.*: linear, as VBOF's)
+  nightflow eval judged --models pwcnet_fcdn,zero          (each exposure by its scene's reference)
+  nightflow eval reference photos/ --linear --out judged   (NAME_img1.jpg, _img2.jpg: sRGB)
+  nightflow eval ladder judged --models pwcnet_fcdn,zero   (the same, photographed ever darker)
   nightflow eval reference mine/ --model big=flownet2.onnx --out judged
 
-CCPPQQEE is camera, position before, position after and exposure, two digits each, 01 the brightest. Exposures of one
-scene, taken from the very same two places, share the reference of the brightest whose files are whole.
-A vector is kept where the flow back from its end leads to its beginning (Sundaram et al. 2010) inside the frame;
-elsewhere NAME_flow.flo says unknown (1e10), and nobody is judged there.
---out gets the frames (linked, copied where that can't be done), NAME_flow.flo, pictures/NAME_mask.png (white: known),
-pictures/NAME_colours.png and reference.md. Where pairs have a NAME_flow.flo, the reference is compared with it.
-Raws are reduced to 736 columns, as VBOF's; a picture's memory grows with the square of its area: 1280x720 is large.
+CCPPQQEE is camera, position before, position after and exposure, two digits each, 01 the brightest. \
+Exposures of one scene, taken from the very same two places, share the reference of the brightest whose \
+files are whole.
+
+A vector is kept where the flow back from its end leads to its beginning (Sundaram et al. 2010) inside \
+the frame; elsewhere NAME_flow.flo says unknown (1e10), and nobody is judged there. A pair of which less \
+than a tenth is kept has no reference. Don't judge the network that made it, nor a relative: they err alike.
+
+--out gets the frames (linked, copied where that can't be done), NAME_flow.flo, pictures/NAME_mask.png \
+(white: known), pictures/NAME_colours.png and reference.md. Where pairs have a NAME_flow.flo, the reference \
+is compared with it.
+
+Raws are reduced to 736 columns, as VBOF's. Pictures are taken as they are, and RAFT's memory grows with the \
+square of their area: 0.6 GB at 640x480, 4.3 GB at 1280x720.
+
 A missing or torn file is named and left out, and the program ends with 3.")]
 pub struct Args {
     /// The pairs: CCPPQQEE_img1.* and CCPPQQEE_img2.* (VBOF), or NAME_img1.* and NAME_img2.*.
@@ -95,6 +103,7 @@ pub fn run(args: &Args) -> Result<Exit> {
             "|F + B|² ≤ 0.01 (|F|² + |B|²) + 0.5 inside the frame (Sundaram et al. 2010)".into(),
         ),
         ("judge by it".to_owned(), format!("nightflow eval {}{judge} --models pwcnet_fcdn,zero", args.out.display())),
+        ("not to be judged".to_owned(), format!("{} and its relatives, which err as the reference does", method.name)),
     ];
     let bar = super::progress(scenes.len())?;
     let mut rows = vec![];
@@ -156,8 +165,9 @@ fn make(scene: &[Item], method: &mut Method, args: &Args, skipped: &mut Vec<Skip
             skipped.push(Skipped { what: item.name.clone(), why });
             continue;
         };
-        if checked.valid == 0.0 {
-            let why = "no vector comes back to where it began, so that there is no reference".into();
+        if checked.valid < reference::VALID_MIN {
+            let [found, least] = [checked.valid, reference::VALID_MIN].map(|part| 100.0 * part);
+            let why = format!("expected {least} % of its vectors to come back to where they began, found {found:.1} %");
             skipped.push(Skipped { what: item.name.clone(), why });
             continue;
         }
