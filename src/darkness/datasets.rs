@@ -46,7 +46,8 @@ pub struct Item {
     pub condition: String,
     /// The two frames' files.
     pub frames: [PathBuf; 2],
-    /// Files of the truth, each with what the tables sort it under; KITTI has two of them.
+    /// Files of the truth, each with what the tables sort it under; KITTI has two of them. None where a pair was looked
+    /// for that need not have one.
     pub truths: Vec<(String, PathBuf)>,
 }
 
@@ -93,6 +94,17 @@ pub enum Error {
         /// Some of what is in it.
         found: String,
     },
+    /// Pairs that are told by their flow files can't be found without them.
+    #[error(
+        "{}: expected pairs that are known without their flow, CCPPQQEE_img1.* with CCPPQQEE_img2.* (vbof) or NAME_img1.* \
+         with NAME_img2.* (pairs), found the layout of {found}", path.display()
+    )]
+    Labelled {
+        /// The folder.
+        path: PathBuf,
+        /// The layout's name.
+        found: &'static str,
+    },
 }
 
 /// A pair in memory.
@@ -115,6 +127,15 @@ fn names(folder: &Path) -> Vec<String> {
 
 /// Looks at a folder; `kind` overrides what its layout says.
 pub fn find(folder: &Path, kind: Option<Kind>) -> Result<Found, Error> {
+    look(folder, kind, true)
+}
+
+/// Looks at a folder of pairs that need no truth: VBOF's layout or FlyingChairs'. A truth that is there is found too.
+pub fn find_unlabelled(folder: &Path, kind: Option<Kind>) -> Result<Found, Error> {
+    look(folder, kind, false)
+}
+
+fn look(folder: &Path, kind: Option<Kind>, labelled: bool) -> Result<Found, Error> {
     let top = fs::read_dir(folder).map_err(|source| Error::Io { path: folder.into(), source })?;
     drop(top);
     // The sets' archives unpack into these.
@@ -132,7 +153,11 @@ pub fn find(folder: &Path, kind: Option<Kind>) -> Result<Found, Error> {
         }
     };
     let (mut items, skipped) = match kind {
-        Kind::Vbof | Kind::Pairs => pairs(root, kind),
+        Kind::Vbof | Kind::Pairs => pairs(root, kind, labelled),
+        _ if !labelled => {
+            let found = KINDS.iter().find(|(_, known)| *known == kind).map_or("", |(name, _)| name);
+            return Err(Error::Labelled { path: folder.into(), found });
+        }
         Kind::Middlebury => whole(middlebury(root)),
         Kind::Sintel => whole(sintel(root)),
         Kind::Kitti => whole(kitti(root)),
@@ -172,7 +197,7 @@ fn part_of(name: &str) -> Option<(&str, usize)> {
     (fits && !stem.is_empty()).then_some((stem, role))
 }
 
-fn pairs(root: &Path, kind: Kind) -> (Vec<Item>, Vec<Skipped>) {
+fn pairs(root: &Path, kind: Kind, labelled: bool) -> (Vec<Item>, Vec<Skipped>) {
     let mut parts: BTreeMap<String, [Option<PathBuf>; 3]> = BTreeMap::new();
     for name in names(root) {
         if let Some((stem, role)) = part_of(&name) {
@@ -195,13 +220,14 @@ fn pairs(root: &Path, kind: Kind) -> (Vec<Item>, Vec<Skipped>) {
             _ => "all".into(),
         };
         match (first, second, flow) {
-            (Some(first), Some(second), Some(flow)) => {
-                items.push(Item { truths: vec![(condition.clone(), flow)], name, condition, frames: [first, second] })
+            (Some(first), Some(second), flow) if flow.is_some() || !labelled => {
+                let truths = flow.map(|flow| (condition.clone(), flow)).into_iter().collect();
+                items.push(Item { truths, name, condition, frames: [first, second] })
             }
-            (None, None, Some(_)) if kind == Kind::Vbof => {}
+            (None, None, Some(_)) if kind == Kind::Vbof || !labelled => {}
             (first, second, flow) => {
-                let lacks =
-                    [(first.is_none(), "_img1.*"), (second.is_none(), "_img2.*"), (flow.is_none(), "_flow.flo")];
+                let flowless = labelled && flow.is_none();
+                let lacks = [(first.is_none(), "_img1.*"), (second.is_none(), "_img2.*"), (flowless, "_flow.flo")];
                 let lacks: Vec<String> =
                     lacks.iter().filter(|(lacks, _)| *lacks).map(|(_, part)| format!("{name}{part}")).collect();
                 skipped.push(Skipped { why: format!("there is no {}", lacks.join(", no ")), what: name });
@@ -294,20 +320,22 @@ fn kitti(root: &Path) -> Vec<Item> {
     items
 }
 
-/// Reads a pair; what doesn't fit is named.
+/// Reads a pair; what doesn't fit is named. Raws are reduced to the truth's size, or as [`raws::pair`] says without one.
 pub fn load(item: &Item) -> Result<Loaded, Skipped> {
     let skip = |why: String| Skipped { what: item.name.clone(), why };
     let mut truths = Vec::with_capacity(item.truths.len());
     for (condition, path) in &item.truths {
         truths.push((condition.clone(), flow_files::read(path).map_err(|error| skip(said(&error)))?));
     }
-    let size = truths.first().map_or((0, 0), |(_, truth)| (truth.width, truth.height));
+    let size = truths.first().map(|(_, truth)| (truth.width, truth.height));
     let frames = if item.frames.iter().any(|path| photographs::is_raw(&path.to_string_lossy())) {
         raws::pair(item.frames.each_ref().map(PathBuf::as_path), size).map_err(|error| skip(said(&error)))?
     } else {
         let read = |path: &PathBuf| flow_files::read_frame(path).map(Picture::from).map_err(|error| skip(said(&error)));
         [read(&item.frames[0])?, read(&item.frames[1])?]
     };
+    let against = if size.is_some() { "truth" } else { "older frame" };
+    let size = size.unwrap_or((frames[0].width, frames[0].height));
     for (what, (width, height)) in frames
         .iter()
         .zip(&item.frames)
@@ -320,7 +348,7 @@ pub fn load(item: &Item) -> Result<Loaded, Skipped> {
         )
     {
         if (width, height) != size {
-            return Err(skip(format!("{what} is {width}×{height}, its truth is {}×{}", size.0, size.1)));
+            return Err(skip(format!("{what} is {width}×{height}, its {against} is {}×{}", size.0, size.1)));
         }
     }
     Ok(Loaded { frames, truths })

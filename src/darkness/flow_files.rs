@@ -13,7 +13,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use image::{Rgb, RgbImage};
+use image::{GrayImage, Luma, Rgb, RgbImage};
 
 pub use self::{
     flo::{flo_bytes, parse_flo},
@@ -158,6 +158,14 @@ impl Error {
         let path = path.to_owned();
         move |flaw| Error::Content { path, flaw }
     }
+
+    fn picture(path: &Path) -> impl FnOnce(image::ImageError) -> Error {
+        let path = path.to_owned();
+        move |error| match error {
+            image::ImageError::IoError(source) => Error::Io { path, source },
+            other => Error::Content { path, flaw: Flaw::Picture(other.to_string()) },
+        }
+    }
 }
 
 impl Field {
@@ -263,10 +271,17 @@ pub fn write(path: &Path, field: &Field) -> Result<(), Error> {
 /// Writes the flow as a picture in the colours of the wheel; the rim is `longest` pixels.
 pub fn write_picture(path: &Path, field: &Field, longest: f32) -> Result<(), Error> {
     field.check().map_err(Error::content(path))?;
-    field.picture(longest).save(path).map_err(|error| match error {
-        image::ImageError::IoError(source) => Error::Io { path: path.into(), source },
-        other => Error::Content { path: path.into(), flaw: Flaw::Picture(other.to_string()) },
-    })
+    field.picture(longest).save(path).map_err(Error::picture(path))
+}
+
+/// Writes where the flow is known as a grey picture: white there, black elsewhere.
+pub fn write_mask(path: &Path, field: &Field) -> Result<(), Error> {
+    field.check().map_err(Error::content(path))?;
+    let mask = GrayImage::from_fn(field.width as u32, field.height as u32, |x, y| {
+        let known = field.known(y as usize * field.width + x as usize);
+        Luma([if known { 255 } else { 0 }])
+    });
+    mask.save(path).map_err(Error::picture(path))
 }
 
 fn ending(path: &Path) -> String {

@@ -27,6 +27,7 @@ pub mod plane;
 pub mod profiles;
 pub mod raws;
 pub mod recipes;
+pub mod reference;
 pub mod report;
 mod scene;
 pub mod scenes;

@@ -74,9 +74,21 @@ pub struct Binned {
 }
 
 impl Mosaic {
+    /// Side of a cell that holds every colour.
+    fn side(&self) -> usize {
+        if self.period.is_multiple_of(3) { 3 } else { 2 }
+    }
+
+    /// Columns and rows of a picture of its shape with at most so many columns, and no more than there are cells.
+    pub fn size_of(&self, columns: usize) -> (usize, usize) {
+        let (width, height) = (self.width / self.side(), self.height / self.side());
+        let columns = columns.min(width);
+        (columns, (height * columns + width / 2) / width.max(1))
+    }
+
     /// Means of each colour in each cell, 2 × 2 or 3 × 3.
     pub fn binned(&self) -> Result<Binned, Error> {
-        let side = if self.period.is_multiple_of(3) { 3 } else { 2 };
+        let side = self.side();
         let (width, height) = (self.width / side, self.height / side);
         let colour = |x: usize, y: usize| usize::from(self.colours[y % self.period * self.period + x % self.period]);
         let complete = |cell: (usize, usize)| {
@@ -157,9 +169,13 @@ pub fn scaled(mosaics: [&Mosaic; 2], (width, height): (usize, usize)) -> Result<
     }))
 }
 
-/// Reads two raw files and scales them as [`scaled`] does.
-pub fn pair(paths: [&Path; 2], size: (usize, usize)) -> Result<[Picture; 2], Error> {
+/// Columns that raws are reduced to where no truth says how many: the benchmark's.
+pub const COLUMNS: usize = 736;
+
+/// Reads two raw files and scales them as [`scaled`] does, without a size to one of [`COLUMNS`] with the same shape.
+pub fn pair(paths: [&Path; 2], size: Option<(usize, usize)>) -> Result<[Picture; 2], Error> {
     let [first, second] = [mosaic(paths[0])?, mosaic(paths[1])?];
+    let size = size.unwrap_or_else(|| first.size_of(COLUMNS));
     scaled([&first, &second], size)
 }
 

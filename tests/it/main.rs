@@ -30,6 +30,7 @@ mod peers;
 mod providers;
 mod recording;
 mod recordings;
+mod reference;
 mod refine;
 mod results;
 mod road;

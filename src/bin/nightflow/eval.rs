@@ -1,5 +1,7 @@
 //! `nightflow eval`: methods judged on data sets with true flow, as they are or photographed ever darker.
 
+mod reference;
+
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
@@ -31,13 +33,14 @@ Examples:
   nightflow eval Sintel/training --models pwcnet_fcdn,raft=raft_small.onnx --linear
   nightflow eval ladder pairs/ --camera 'Canon EOS M6' --iso 3200 --models pwcnet_fcdn,zero --enhancers none,nlm
   nightflow eval pairs/ --models dis=results/dis --enhancers none
+  nightflow eval reference mine/ --out judged             (pairs without a truth: see its --help)
 
 A data set is known by its layout: VBOF (CCPPQQEE_img1.*), FlyingChairs and FCDN (NAME_img1.*, NAME_img2.*,
 NAME_flow.flo), Middlebury (other-data, other-gt-flow), Sintel (clean, final, flow), KITTI (image_2, flow_occ).
 A missing or torn file is named and left out, every cell says how many pairs it holds, and the program ends with 3.")]
 pub struct Args {
     #[command(subcommand)]
-    ladder: Option<Sub>,
+    sub: Option<Sub>,
     /// The data set's folder.
     #[arg(required = true)]
     dataset: Option<PathBuf>,
@@ -52,6 +55,8 @@ pub struct Args {
 enum Sub {
     /// Photograph bright pairs at seven ever darker exposures with a camera's noise, and judge methods on each.
     Ladder(LadderArgs),
+    /// Make reference flow for bright pairs of your own, so that darker exposures of the same scenes can be judged.
+    Reference(reference::Args),
 }
 
 /// The brightness ladder: linearise, expose to raw means of 0.4 … 0.001, count photons, read, quantise, scale to 0.4.
@@ -128,7 +133,8 @@ fn kind(text: &str) -> Result<Kind, String> {
 
 /// Evaluates and prints the tables.
 pub fn run(args: Args) -> Result<Exit> {
-    match (args.ladder, args.dataset) {
+    match (args.sub, args.dataset) {
+        (Some(Sub::Reference(args)), _) => reference::run(&args),
         (Some(Sub::Ladder(ladder)), _) => {
             if ladder.patch.is_multiple_of(2) {
                 bail!("--patch is {}; expected an odd number of pixels, as 15", ladder.patch);
