@@ -79,7 +79,7 @@ pub struct Config {
     pub runtime: PathBuf,
     /// Threads of the network.
     pub threads: usize,
-    /// What computes the cost volumes; plain where the network has no fused graph.
+    /// What computes the cost volumes; plain where the network has no fused graph, and for providers other than `cpu`.
     pub operators: Operators,
     /// What computes the graphs.
     pub provider: Provider,

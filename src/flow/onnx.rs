@@ -18,7 +18,7 @@ use ort::{
 use tracing::info;
 
 use crate::flow::{
-    Config, Error, Operators, Precision, cost_volume,
+    Config, Error, Operators, Precision, Provider, cost_volume,
     manifest::{self, Kind},
     network::{Golden, Model, Network, Raster, Slot},
     padding::Padded,
@@ -50,6 +50,16 @@ pub struct Onnx {
     golden: Option<Golden>,
     model: Model,
     copied: u64,
+    /// What it takes to open the graphs again for a size, for providers that are faster where they know it.
+    fixed: Option<Fixed>,
+}
+
+/// Graphs that are opened for one size of images at a time.
+struct Fixed {
+    loaded: Loaded,
+    config: Config,
+    /// The pyramid's and the decoder's.
+    bytes: [Vec<u8>; 2],
 }
 
 /// A session and what is bound to it. Bindings must not outlive their session, hence the order of the fields.
@@ -107,11 +117,28 @@ pub(super) fn load(mut builder: SessionBuilder, bytes: &[u8]) -> Result<Session,
     builder.commit_from_memory(bytes).map_err(failed("load a graph"))
 }
 
+/// The names of the graphs' dimensions, and their lengths for images of this size.
+fn dimensions([width, height]: [usize; 2]) -> impl Iterator<Item = (String, i64)> {
+    let whole = [("width".to_owned(), width as i64), ("height".to_owned(), height as i64)];
+    let level = move |level: usize| {
+        let of = |name: &str, length: usize| (format!("{name}_level{level}"), (length >> level) as i64);
+        [of("columns", width), of("rows", height)]
+    };
+    whole.into_iter().chain((0..=6).flat_map(level))
+}
+
 impl Graph {
     /// Sequential, with a fixed number of threads: the order of every sum is fixed, so a replay gives the same bytes.
-    fn open((environment, library): &Loaded, bytes: &[u8], config: &Config) -> Result<Self, Error> {
+    ///
+    /// `size` fixes the columns and rows of the images, by the names that the graphs give their dimensions.
+    fn open(
+        (environment, library): &Loaded,
+        bytes: &[u8],
+        config: &Config,
+        size: Option<[usize; 2]>,
+    ) -> Result<Self, Error> {
         let doing = "set up a session";
-        let session = Session::builder(environment)
+        let mut session = Session::builder(environment)
             .map_err(failed(doing))?
             .with_intra_threads(config.threads.max(1))
             .map_err(failed(doing))?
@@ -132,6 +159,9 @@ impl Graph {
             .map_err(failed(doing))?
             .with_execution_providers(provider::wanted(config, library)?)
             .map_err(failed("start the execution provider"))?;
+        for (name, length) in size.into_iter().flat_map(dimensions) {
+            session = session.with_dimension_override(name, length).map_err(failed(doing))?;
+        }
         let session = load(session, bytes)?;
         let binding = session.create_binding().map_err(failed("bind"))?;
         Ok(Self { binding, session })
@@ -193,6 +223,12 @@ fn features(entry: &manifest::Entry, pyramid: &Graph, decoder: &Graph) -> Result
 
 /// What computes the cost volumes; the entry's decoder becomes the graph for it.
 fn chosen(config: &Config, entry: &mut manifest::Entry) -> Operators {
+    if config.operators == Operators::Fused && config.provider != Provider::Cpu {
+        // Between two calls of our operator another provider's threads and the runtime's wait for each other, which costs
+        // more than the operator saves.
+        info!("provider {:?} is given the whole decoder, with plain operators", config.provider);
+        return Operators::Plain;
+    }
     match (config.operators, entry.fused.take()) {
         (Operators::Fused, Some(fused)) => {
             entry.decoder = fused;
@@ -219,16 +255,19 @@ impl Onnx {
             return Err(Error::Coarse { network: config.network.clone(), precision });
         }
         let operators = chosen(config, &mut entry);
-        let open = |file| Graph::open(&loaded, &manifest::read(&folder, file)?, config);
-        let (pyramid, decoder) = (open(&entry.pyramid)?, open(&entry.decoder)?);
+        let bytes = [manifest::read(&folder, &entry.pyramid)?, manifest::read(&folder, &entry.decoder)?];
+        let open = |bytes: &[u8]| Graph::open(&loaded, bytes, config, None);
+        let (pyramid, decoder) = (open(&bytes[0])?, open(&bytes[1])?);
         let features = features(&entry, &pyramid, &decoder)?;
         let mut assigned = provider::assigned(&pyramid.session).map_err(failed("name its providers"))?;
         for (name, count) in provider::assigned(&decoder.session).map_err(failed("name its providers"))? {
             *assigned.entry(name).or_insert(0) += count;
         }
         provider::check(config, &assigned)?;
-        let library = loaded.1;
+        let library = loaded.1.clone();
         let provider = format!("{} of ONNX Runtime {}", provider::named(&assigned), provider::version(&library));
+        let fixes = config.provider.fixes_sizes();
+        let fixed = fixes.then(|| Fixed { loaded: loaded.clone(), config: config.clone(), bytes });
         let sha256 = [entry.pyramid, entry.decoder].into_iter().map(|file| (file.file, file.sha256)).collect();
         Ok(Self {
             pyramid,
@@ -239,6 +278,7 @@ impl Onnx {
             golden: entry.golden,
             model: Model { name: config.network.clone(), version: entry.version, sha256, operators, provider, library },
             copied: 0,
+            fixed,
         })
     }
 
@@ -249,6 +289,11 @@ impl Onnx {
             self.pyramid.binding.clear();
             self.decoder.binding.clear();
             self.memory = None;
+            if let Some(Fixed { loaded, config, bytes: [pyramid, decoder] }) = &self.fixed {
+                let size = Some([width, height]);
+                self.pyramid = Graph::open(loaded, pyramid, config, size)?;
+                self.decoder = Graph::open(loaded, decoder, config, size)?;
+            }
             self.memory = Some(Memory::new(width, height, &self.features).map_err(failed("reserve memory"))?);
         }
         // The branch above has just filled it.

@@ -73,6 +73,11 @@ impl Provider {
         }
     }
 
+    /// Whether it is much faster with graphs that were opened for one size; opening takes it up to a second.
+    pub fn fixes_sizes(self) -> bool {
+        matches!(self, Provider::OpenVino | Provider::TensorRt)
+    }
+
     fn precisions(self) -> &'static [Precision] {
         match self {
             Provider::Cpu | Provider::Cuda | Provider::Xnnpack => &[Precision::Fp32],
