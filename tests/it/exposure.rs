@@ -8,7 +8,7 @@ use std::collections::BTreeSet;
 use nightflow::{
     camera::Frame,
     clock::Stamp,
-    exposure::{Config, Developer, Exposed, REASONS},
+    exposure::{Config, Developer, Error, Exposed, REASONS},
     wire::{Header, Image, Time},
 };
 use proptest::prelude::*;
@@ -72,8 +72,17 @@ proptest! {
     /// Every encoding, byte order, padding, depth and size, to the last places of the slow reference.
     #[test]
     fn equals_the_reference(scene in reference::scenes()) {
-        let developed = developed(&scene.config, &scene.frame);
         let expected = reference(&scene);
+        let mut developer = Developer::new(&scene.config).unwrap();
+        let result = developer.develop(&scene.frame);
+        // Dark noise around the black level may fall below it as a whole, in small frames: that is refused.
+        let below = -expected.light - (1.0 / 256.0f64).max(1.0 / (scene.white - scene.black));
+        if below > -1e-9 {
+            prop_assert!(below < 1e-9 || matches!(result, Err(Error::BlackAboveMean { .. })), "{result:?}");
+            return Ok(());
+        }
+        prop_assert!(result.is_ok(), "{result:?}");
+        let developed = developer.newest().unwrap().clone();
         prop_assert_eq!([developed.width, developed.height], expected.size);
         prop_assert_eq!(developed.scale, expected.scale);
         prop_assert_eq!(&developed.saturated, &expected.saturated);

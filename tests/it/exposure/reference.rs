@@ -37,6 +37,8 @@ pub struct Developed {
     pub reduced: Vec<f64>,
     pub saturated: Vec<u8>,
     pub raw_mean: f64,
+    /// The mean of all pixels, of which a mosaic has twice as many green ones.
+    pub light: f64,
 }
 
 /// The overlap of [a, a + 1) with the output pixel `i` of size `scale`.
@@ -86,12 +88,15 @@ pub fn reference(scene: &Scene) -> Developed {
         }
     }
     let raw_mean = reduced.iter().sum::<f64>() / reduced.len() as f64;
+    let light =
+        raw_mean * 0.75 + reduced[width * height..2 * width * height].iter().sum::<f64>() / (4 * width * height) as f64;
     Developed {
         size: [width, height],
         scale: std::array::from_fn(|i| (scale[i] * cell as f64) as f32),
         reduced,
         saturated,
         raw_mean,
+        light,
     }
 }
 
