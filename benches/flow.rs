@@ -6,31 +6,12 @@ use std::{hint::black_box, path::PathBuf, time::Duration};
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use nightflow::{
-    clock::Stamp,
     exposure::{Exposed, Pair},
-    flow::{Config, Fake, Matcher, Own, Resolution},
+    flow::{self, Config, Fake, Matcher, Own, Resolution},
 };
 
 fn frames(width: usize, height: usize) -> Vec<Exposed> {
-    let frame = |number: u64| {
-        let value = |i: usize| {
-            let (x, y) = (i % width, i / width % height);
-            let (x, y) = (x as f32 + 1.5 * number as f32, y as f32);
-            0.4 + 0.2 * (0.31 * x + 0.17 * y).sin() * (0.23 * y - 0.11 * x).cos()
-        };
-        Exposed {
-            stamp: Stamp::from_ns(number as i64 * 33_000_000),
-            width,
-            height,
-            scale: [4.0, 4.0],
-            rgb: (0..3 * width * height).map(value).collect(),
-            saturated: vec![0; width * height],
-            raw_mean: 0.05,
-            generation: number,
-            ..Exposed::default()
-        }
-    };
-    (1..=3).map(frame).collect()
+    (1..=3).map(|number| flow::pattern(width, height, number)).collect()
 }
 
 /// Steps through the frames for ever. Three of them, so that every step has one new frame.
@@ -46,7 +27,7 @@ fn step(bench: &mut criterion::Bencher, matcher: &mut Matcher, frames: &[Exposed
     });
 }
 
-fn flow(criterion: &mut Criterion) {
+fn stage(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("flow");
     group.sample_size(20).measurement_time(Duration::from_secs(6)).warm_up_time(Duration::from_secs(1));
     let quarter = Config::default();
@@ -74,5 +55,5 @@ fn flow(criterion: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, flow);
+criterion_group!(benches, stage);
 criterion_main!(benches);

@@ -15,11 +15,11 @@ use std::{
 
 use multiversion::multiversion;
 use nightflow::{
-    clock::Stamp,
-    exposure::{Exposed, Pair},
+    exposure::Pair,
     flow::{
         Config, Matcher, Operators, Own,
         cost_volume::{CostVolume, Inputs, Outputs, Shape, Unfit},
+        pattern,
     },
 };
 
@@ -31,25 +31,6 @@ const THREADS: [usize; 2] = [1, 2];
 struct Rounds {
     decoder: usize,
     volume: usize,
-}
-
-fn exposed(width: usize, height: usize, number: u64) -> Exposed {
-    let value = |i: usize| {
-        let (x, y) = ((i % width) as f32 + 2.0 * number as f32, (i / width % height) as f32 + number as f32);
-        0.4 + 0.2 * (0.31 * x + 0.17 * y).sin() * (0.23 * y - 0.11 * x).cos() + 0.1 * (0.9 * x).sin() * (0.7 * y).sin()
-    };
-    Exposed {
-        stamp: Stamp::from_ns(number as i64 * 33_000_000),
-        width,
-        height,
-        scale: [4.0, 4.0],
-        rgb: (0..3 * width * height).map(value).collect(),
-        saturated: vec![0; width * height],
-        raw_mean: 0.1,
-        gain: 4.0,
-        generation: number,
-        ..Exposed::default()
-    }
 }
 
 /// Milliseconds of each of the things that run in turns: the median of all rounds.
@@ -84,7 +65,7 @@ fn decoders(models: &Path, rounds: Rounds) -> Result<(), String> {
     println!("decoder, ms            plain    fused    plain/fused");
     for network in networks(models)? {
         for (width, height) in SIZES {
-            let pair = [exposed(width, height, 1), exposed(width, height, 2)];
+            let pair = [pattern(width, height, 1), pattern(width, height, 2)];
             for threads in THREADS {
                 let open = |operators| {
                     let config = Config {

@@ -60,6 +60,15 @@ pub struct Skipped {
     pub why: String,
 }
 
+/// What could not be used, as Markdown; nothing where there is nothing.
+pub fn left_out(skipped: &[Skipped]) -> String {
+    if skipped.is_empty() {
+        return String::new();
+    }
+    let lines: String = skipped.iter().map(|Skipped { what, why }| format!("- {what}: {why}\n")).collect();
+    format!("\n### Left out: {}\n\n{lines}", skipped.len())
+}
+
 /// What was found in a folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Found {

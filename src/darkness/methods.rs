@@ -12,12 +12,9 @@ use crate::{
     exposure::{Exposed, Pair},
     flow::{
         Config, Error as FlowError, Graph, Matcher, Own, Resolution,
-        padding::{self, Padded},
+        padding::{self, Padded, STRIDE},
     },
 };
-
-/// Sides of what a graph is given are multiples of this: six halvings, as for our own.
-const STRIDE: usize = 64;
 
 /// What a method is shown.
 #[derive(Debug, Clone, Copy)]

@@ -12,7 +12,7 @@
 use std::fmt::Write as _;
 
 use super::{
-    datasets::{Item, Kind, Skipped},
+    datasets::{self, Item, Kind, Skipped},
     flow_files::Field,
 };
 
@@ -181,11 +181,5 @@ pub fn markdown(about: &[(String, String)], rows: &[Row], skipped: &[Skipped]) -
         let _ = write!(text, "| mean of {} | {pairs} | {valid:.1} | {length:.2} | {apart:.3} |", rows.len());
         let _ = writeln!(text, "{}", error(Some(against)));
     }
-    if !skipped.is_empty() {
-        let _ = writeln!(text, "\n### Left out: {}\n", skipped.len());
-        for Skipped { what, why } in skipped {
-            let _ = writeln!(text, "- {what}: {why}");
-        }
-    }
-    text
+    text + &datasets::left_out(skipped)
 }

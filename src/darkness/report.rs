@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::{
     bound::Limit,
-    datasets::Skipped,
+    datasets::{self, Skipped},
     faults::Fault,
     score::{Score, Spread},
 };
@@ -157,7 +157,7 @@ impl Report {
         if !self.faults.is_empty() {
             self.by_fault(&mut text, &methods);
         }
-        self.left_out(&mut text);
+        text += &datasets::left_out(&self.skipped);
         text
     }
 
@@ -194,16 +194,6 @@ impl Report {
     fn heading(&self, text: &mut String, methods: &[String], more: &[&str]) {
         let columns: Vec<&str> = methods.iter().map(String::as_str).chain(more.iter().copied()).collect();
         let _ = writeln!(text, "| | {} |\n|{}", columns.join(" | "), " --- |".repeat(columns.len() + 1));
-    }
-
-    fn left_out(&self, text: &mut String) {
-        if self.skipped.is_empty() {
-            return;
-        }
-        let _ = writeln!(text, "\n### Left out: {}\n", self.skipped.len());
-        for Skipped { what, why } in &self.skipped {
-            let _ = writeln!(text, "- {what}: {why}");
-        }
     }
 
     /// The mean table, one line a cell; with a column for the kind of noise where they are compared.

@@ -1,9 +1,13 @@
-//! Networks without weights: a known shift and a plain block matcher, for tests where the weights do not matter.
+//! Networks without weights and frames without a camera, for tests and benches where neither matters.
 
-use crate::flow::{
-    Error, Operators,
-    network::{Model, Network, Raster, Slot},
-    padding::Padded,
+use crate::{
+    clock::Stamp,
+    exposure::Exposed,
+    flow::{
+        Error, Operators,
+        network::{Model, Network, Raster, Slot},
+        padding::Padded,
+    },
 };
 
 /// Half of the side of the blocks that are compared.
@@ -23,6 +27,27 @@ pub struct Fake {
 enum Answer {
     Shift([f32; 2]),
     Match { reach: isize },
+}
+
+/// Frame `number` of a pattern that moves by two pixels to the left and one up a frame: `linear` is left empty, for
+/// nothing but a network looks at it. `nightflow bench`'s rivals make the same.
+pub fn pattern(width: usize, height: usize, number: u64) -> Exposed {
+    let value = |i: usize| {
+        let (x, y) = ((i % width) as f32 + 2.0 * number as f32, (i / width % height) as f32 + number as f32);
+        0.4 + 0.2 * (0.31 * x + 0.17 * y).sin() * (0.23 * y - 0.11 * x).cos() + 0.1 * (0.9 * x).sin() * (0.7 * y).sin()
+    };
+    Exposed {
+        stamp: Stamp::from_ns(number as i64 * 33_000_000),
+        width,
+        height,
+        scale: [4.0, 4.0],
+        rgb: (0..3 * width * height).map(value).collect(),
+        saturated: vec![0; width * height],
+        raw_mean: 0.1,
+        gain: 4.0,
+        generation: number + 1,
+        ..Exposed::default()
+    }
 }
 
 /// The mean of the three colours.

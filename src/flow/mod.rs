@@ -22,7 +22,7 @@ use crate::clock::Stamp;
 pub use self::{
     config::{Config, Operators, Precision, Provider, REASONS, Resolution},
     error::Error,
-    fake::Fake,
+    fake::{Fake, pattern},
     golden::Deviation,
     matcher::{Counts, Matcher},
     network::{Golden, Model, Network, Raster, Slot},

@@ -2,7 +2,10 @@
 
 use std::path::PathBuf;
 
-use crate::flow::{Error, Operators, padding::Padded};
+use crate::flow::{
+    Error, Operators,
+    padding::{self, Padded},
+};
 
 /// Which of the two places for a frame's features.
 ///
@@ -45,9 +48,9 @@ pub struct Raster<'a> {
 /// It comes in two steps, so that what concerns one frame alone is done once though the frame stands in two pairs. A
 /// graph that takes two images at once keeps the image in `describe` and does its work in `between`.
 pub trait Network: Send {
-    /// Rows and columns of the images must be multiples of this. 64 for six halvings.
+    /// Rows and columns of the images must be multiples of this.
     fn stride(&self) -> usize {
-        64
+        padding::STRIDE
     }
 
     /// Looks at one frame and keeps what it found in `slot`. Both slots always hold frames of one size.

@@ -2,6 +2,9 @@
 
 use crate::exposure::Exposed;
 
+/// Sides of the networks' images are multiples of this: six halvings.
+pub const STRIDE: usize = 64;
+
 /// The smallest multiple of `stride` that holds `length`.
 pub fn padded(length: usize, stride: usize) -> usize {
     length.div_ceil(stride).max(1) * stride

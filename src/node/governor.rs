@@ -7,10 +7,13 @@
 
 use std::fmt;
 
-use crate::{clock::Stamp, exposure};
+use crate::{
+    clock::Stamp,
+    exposure,
+    // Narrower steps than this save nothing.
+    flow::padding::{STRIDE as STEP, padded},
+};
 
-/// Sides of the network's images are multiples of this, so that narrower steps than this save nothing.
-const STEP: usize = 64;
 /// A greater share of the time between two frames is too much, …
 const SHARE_MAX: f64 = 0.95;
 /// … and this is what a narrower width must fit into, so that it need not be narrowed at once again.
@@ -163,7 +166,7 @@ impl Governor {
 /// Pixels that the network gets for an image of this width, padded to whole steps.
 fn area(width: usize, [columns, rows]: [usize; 2]) -> f64 {
     let rows = (width * rows).div_ceil(columns.max(1));
-    (width.next_multiple_of(STEP) * rows.next_multiple_of(STEP)) as f64
+    (padded(width, STEP) * padded(rows, STEP)) as f64
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 mod errors;
 mod machine;
-mod ours;
+pub mod ours;
 mod picture;
 mod report;
 mod rival;
@@ -15,7 +15,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use nightflow::{
     exposure::Exposed,
     flow::{
-        Config, Operators, Resolution,
+        Config, Matcher, Operators, Resolution,
         manifest::{self, Entry},
     },
 };
@@ -264,7 +264,7 @@ impl<'a> Bench<'a> {
 /// Opens a network and lets it make two steps, so that it has all of its memory.
 fn enter(what: What, config: &Config, frames: &Rc<[Exposed]>, report: &mut Report) -> Result<Turn> {
     let before = machine::settled();
-    let mut ours = Ours::open(config, frames.clone()).with_context(|| what.to_string())?;
+    let mut ours = Ours::with(Matcher::open(config).with_context(|| what.to_string())?, frames.clone());
     for _ in 0..2 {
         ours.step().with_context(|| what.to_string())?;
     }

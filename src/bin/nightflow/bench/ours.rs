@@ -4,44 +4,22 @@ use std::rc::Rc;
 
 use anyhow::{Result, ensure};
 use nightflow::{
-    clock::{self, Stamp},
+    clock,
     exposure::{Exposed, Pair},
-    flow::{Config, Graph, Matcher, Own},
+    flow::{self, Config, Graph, Matcher, Own, padding},
 };
 
 /// Frames that take turns: three would do for each to be new to the matcher, which keeps two.
 const FRAMES: u64 = 4;
 
-/// Images of networks have sides that are multiples of this.
-const STRIDE: usize = 64;
-
 /// Frames of a moving pattern; `benches/rivals/step.py` makes the same.
 pub fn frames(width: usize, height: usize) -> Rc<[Exposed]> {
-    (0..FRAMES).map(|number| frame(width, height, number)).collect()
-}
-
-fn frame(width: usize, height: usize, number: u64) -> Exposed {
-    let value = |i: usize| {
-        let (x, y) = ((i % width) as f32 + 2.0 * number as f32, (i / width % height) as f32 + number as f32);
-        0.4 + 0.2 * (0.31 * x + 0.17 * y).sin() * (0.23 * y - 0.11 * x).cos() + 0.1 * (0.9 * x).sin() * (0.7 * y).sin()
-    };
-    Exposed {
-        stamp: Stamp::from_ns(number as i64 * 33_000_000),
-        width,
-        height,
-        scale: [4.0, 4.0],
-        rgb: (0..3 * width * height).map(value).collect(),
-        saturated: vec![0; width * height],
-        raw_mean: 0.1,
-        gain: 4.0,
-        generation: number + 1,
-        ..Exposed::default()
-    }
+    (0..FRAMES).map(|number| flow::pattern(width, height, number)).collect()
 }
 
 /// What the image becomes for the network.
 pub fn padded(width: usize, height: usize) -> [usize; 2] {
-    [width, height].map(|side| side.next_multiple_of(STRIDE))
+    [width, height].map(|side| padding::padded(side, padding::STRIDE))
 }
 
 /// A matcher that gets one new frame a step, as in the node: the pyramid runs once and the decoder once.
@@ -53,8 +31,8 @@ pub struct Ours {
 }
 
 impl Ours {
-    pub fn open(config: &Config, frames: Rc<[Exposed]>) -> Result<Self> {
-        Ok(Self { matcher: Matcher::open(config)?, frames, own: Own::default(), steps: 0 })
+    pub fn with(matcher: Matcher, frames: Rc<[Exposed]>) -> Self {
+        Self { matcher, frames, own: Own::default(), steps: 0 }
     }
 
     /// What computes it, with its version.
