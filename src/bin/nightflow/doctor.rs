@@ -7,12 +7,16 @@ use nightflow::{
     camera::{self, Next, Sample, SourceConfig},
     clock,
     config::Config,
-    exposure::{Developer, Exposed, Pair},
-    flow::{Matcher, Own},
+    exposure::Developer,
+    flow::Matcher,
     publish::iceoryx2::{bytes_needed, free_bytes},
 };
 
-use crate::{Exit, launch};
+use crate::{
+    Exit,
+    bench::ours::{self, Ours},
+    launch,
+};
 
 /// A receive buffer below this loses most of a camera's fragments (measured: 93 % of VGA frames at 208 KiB).
 const RECEIVE_BUFFER_MIN: u64 = 2 << 20;
@@ -116,34 +120,20 @@ fn network(config: &Config) -> Vec<(&'static str, Finding)> {
             )),
         ),
         ("golden output", golden),
-        ("speed", speed(&mut matcher)),
+        ("speed", speed(matcher)),
     ]
 }
 
-/// The median of five steps on a grey pair of the network's usual size.
-fn speed(matcher: &mut Matcher) -> Finding {
+/// The median of five steps at the network's usual size, each with one new frame, as in a running node.
+fn speed(matcher: Matcher) -> Finding {
     let (width, height) = (320, 256);
-    let mut frames: [Exposed; 2] = std::array::from_fn(|frame| Exposed {
-        width,
-        height,
-        scale: [4.0, 4.0],
-        rgb: (0..3 * width * height).map(|i| 0.4 + 0.2 * ((i + frame) as f32 * 0.37).sin()).collect(),
-        saturated: vec![0; width * height],
-        raw_mean: 0.1,
-        gain: 4.0,
-        generation: frame as u64 + 1,
-        ..Exposed::default()
-    });
-    let mut own = Own::default();
+    let mut ours = Ours::with(matcher, ours::frames(width, height));
     let mut took = Vec::new();
     for _ in 0..6 {
-        frames.swap(0, 1);
-        let start = clock::instant();
-        let [older, newer] = &frames;
-        if let Err(error) = matcher.between(&Pair { older, newer, gain_step: None }, &mut own) {
-            return Finding::Do(error.to_string());
+        match ours.step() {
+            Ok(ms) => took.push(ms),
+            Err(error) => return Finding::Do(error.to_string()),
         }
-        took.push(start.elapsed().as_secs_f64() * 1e3);
     }
     // The first step also warms the runtime up.
     took.remove(0);
