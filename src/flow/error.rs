@@ -111,7 +111,7 @@ pub enum Error {
     },
     /// The network was not shown to be as good in so many bits.
     #[error(
-        "[flow] precision = \"{}\": {network} was not shown to keep its error in it to 2 %, it runs in fp32; pwcnet_fcdn was",
+        "[flow] precision = \"{}\": {network} was not shown to keep its error in it to 2 %, it runs in fp32; those that were: {able}",
         format!("{precision:?}").to_lowercase()
     )]
     Coarse {
@@ -119,6 +119,8 @@ pub enum Error {
         network: String,
         /// What is wanted.
         precision: Precision,
+        /// The manifest's networks that were.
+        able: String,
     },
     /// ONNX Runtime gave no part of the network to the execution provider that the settings name.
     #[error("[flow] provider = {wanted:?}: no node of {network} was given to it, all run on {found}")]

@@ -252,7 +252,10 @@ impl Onnx {
         let Kind::PyramidDecoder = entry.kind;
         let precision = config.precision;
         if precision != Precision::Fp32 && !entry.precisions.contains(&precision) {
-            return Err(Error::Coarse { network: config.network.clone(), precision });
+            let able =
+                manifest::entries(&folder)?.into_iter().filter(|(_, entry)| entry.precisions.contains(&precision));
+            let able = able.map(|(name, _)| name).collect::<Vec<_>>().join(", ");
+            return Err(Error::Coarse { network: config.network.clone(), precision, able });
         }
         let operators = chosen(config, &mut entry);
         let bytes = [manifest::read(&folder, &entry.pyramid)?, manifest::read(&folder, &entry.decoder)?];

@@ -39,6 +39,7 @@ fn a_precision_is_refused_that_a_provider_lacks_or_a_network_was_not_judged_in()
     let error =
         refused(Config { provider: Provider::OpenVino, precision: Precision::Bf16, network, ..Config::default() });
     assert!(error.contains("raftsmall_fcdn was not shown to keep its error in it to 2 %"), "{error}");
+    assert!(error.ends_with("those that were: pwcnet_fcdn, pwcnet_fcdn_fast"), "{error}");
 }
 
 /// The library with OpenVINO among the peers; PyPI has it for x86-64 alone.
