@@ -4,7 +4,9 @@
 //! and a vector is believed where it comes back to where it began (Sundaram, Brox and Keutzer 2010): with F there, B back,
 //! and y = x + F(x) inside the frame,
 //!
-//!     |F(x) + B(y)|² ≤ 0.01 (|F(x)|² + |B(y)|²) + 0.5.
+//! ```text
+//! |F(x) + B(y)|² ≤ 0.01 (|F(x)|² + |B(y)|²) + 0.5
+//! ```
 //!
 //! What is not believed is unknown, and nobody is judged by it. The check finds what is hidden and what is guessed; it
 //! does not find what is wrong both ways alike.
