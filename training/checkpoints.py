@@ -11,6 +11,7 @@ import json
 import shutil
 from pathlib import Path
 
+import onnx
 import torch
 
 PIECE = 16_000_000
@@ -60,3 +61,15 @@ def load(folder: Path) -> dict:
             f"{folder}: expected {heading['bytes']} bytes with sha256 {heading['sha256']}, found {len(body)} with {found}"
         )
     return torch.load(io.BytesIO(body), weights_only=True, map_location="cpu")
+
+
+def of_graphs(name: Path) -> dict[str, torch.Tensor]:
+    """The weights that the graphs `NAME_*.onnx` hold, by their names in PyTorch."""
+    found = {}
+    for file in sorted(name.parent.glob(f"{name.name}_*.onnx")):
+        for tensor in onnx.load(file).graph.initializer:
+            # A copy, for what onnx gives may not be written to.
+            found[tensor.name.removesuffix("_half")] = torch.tensor(onnx.numpy_helper.to_array(tensor)).float()
+    if not found:
+        raise FileNotFoundError(f"expected graphs {name}_*.onnx, found none")
+    return found

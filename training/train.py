@@ -34,6 +34,19 @@ def network_of(description: dict) -> nn.Module:
     raise ValueError(f"expected the network pwcnet or raftsmall, found {kind}")
 
 
+def start(network: nn.Module, where: str) -> None:
+    """Weights to start from: published ones (`*.pth`), or a network's graphs (`../models/pwcnet_fcdn`), which hold its running
+    mean in fp16."""
+    if where.endswith(".pth"):
+        return network.published(where)
+    held = checkpoints.of_graphs(Path(where))
+    missing, unknown = network.load_state_dict(held, strict=False)
+    if unknown:
+        raise ValueError(f"{where}: expected weights of {type(network).__name__}, {unknown} is unknown")
+    if missing:
+        print(f"# {where} has no {', '.join(missing)}", flush=True)
+
+
 def loss_of(network, flows, expected, truth):
     """Weighed sum of end-point errors in pixels of the input, the likelihood of the error heads (exponential law), and the
     last flow's error. `expected` is of the last flow, or a list of the last few."""
@@ -78,7 +91,7 @@ class Run:
         with torch.device("cpu"):
             network = network_of(description)
             if "start" in description:
-                network.published(description["start"])
+                start(network, description["start"])
         self.device = torch.get_default_device()
         # On a CPU instance norms would copy every map into the other layout and back: twice the encoder's time.
         self.layout = torch.channels_last if self.device.type == "cuda" else torch.contiguous_format
@@ -96,10 +109,9 @@ class Run:
             ],
             fused=True,
         )
-        self.forward = self.network
+        # Fuses what lies between the convolutions: cost volume, normalisation, warp. A crop's size is compiled in.
+        self.forward = torch.compile(self.network, dynamic=False) if description["compile"] else self.network
         if self.device.type == "cuda":
-            # Fuses what lies between the convolutions: cost volume, normalisation, warp.
-            self.forward = torch.compile(self.network) if description["compile"] else self.network
             torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
             torch.backends.cudnn.benchmark = True
         self.step, self.seconds = 0, 0.0
