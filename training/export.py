@@ -91,6 +91,81 @@ def fused(network: PwcNet):
             del level.match
 
 
+class Convolutions(torch.autograd.Function):
+    """Convolutions one after the other in bf16, as the node's own operator `nightflow::Convolutions`. Its definition stands in
+    src/flow/convolutions; tracing asks for shapes only."""
+
+    @staticmethod
+    def forward(ctx, parts: int, dilations: list[int], slopes: list[float], kept: bool, *tensors):
+        channels = [bias.numel() for bias in tensors[parts + 1 :: 2]]
+        of = lambda count: tensors[0].new_zeros(1, count, *tensors[0].shape[2:])
+        return (of(channels[-1]), of(channels[-2])) if kept else of(channels[-1])
+
+    @staticmethod
+    def symbolic(g, parts: int, dilations: list[int], slopes: list[float], kept: bool, *tensors):
+        channels = [bias.type().sizes()[0] for bias in tensors[parts + 1 :: 2]]
+        settings = {"parts_i": parts, "dilations_i": dilations, "slopes_f": slopes}
+        found = g.op(f"{DOMAIN}::Convolutions", *tensors, outputs=2 if kept else 1, **settings)
+        for value, count in zip(found if kept else [found], reversed(channels)):
+            value.setType(tensors[0].type().with_sizes([1, count, None, None]))
+        return tuple(found) if kept else found
+
+
+class EncoderLevels(torch.autograd.Function):
+    """RAFT-small's feature encoder in bf16, as the node's own operator `nightflow::Encoder`."""
+
+    @staticmethod
+    def forward(ctx, image, middle: int, *tensors):
+        rows, columns = image.shape[2:]
+        return tuple(image.new_zeros(1, count, rows // part, columns // part) for count, part in ((middle, 4), (tensors[-1].numel(), 8)))
+
+    @staticmethod
+    def symbolic(g, image, middle: int, *tensors):
+        found = g.op(f"{DOMAIN}::Encoder", image, *tensors, outputs=2)
+        for value, count in zip(found, (middle, tensors[-1].type().sizes()[0])):
+            value.setType(image.type().with_sizes([1, count, None, None]))
+        return tuple(found)
+
+
+def convolutions_of(layers: nn.Sequential) -> tuple[list[nn.Conv2d], list[float]]:
+    """Its convolutions and what each multiplies negative results with."""
+    found = [part for part in layers.modules() if isinstance(part, (nn.Conv2d, nn.LeakyReLU))]
+    following = [*found[1:], None]
+    slopes = [after.negative_slope if isinstance(after, nn.LeakyReLU) else 1.0 for after in following]
+    both = [(part, slope) for part, slope in zip(found, slopes) if isinstance(part, nn.Conv2d)]
+    return [part for part, _ in both], [slope for _, slope in both]
+
+
+def chained(layers: nn.Sequential, parts: list[torch.Tensor], kept: bool = False):
+    """What `networks.through` gives, by the one operator; with `kept` also what the layer before the last gives."""
+    convolutions, slopes = convolutions_of(layers)
+    weights = [tensor for convolution in convolutions for tensor in (convolution.weight, convolution.bias)]
+    dilations = [convolution.dilation[0] for convolution in convolutions]
+    return Convolutions.apply(len(parts), dilations, slopes, kept, *parts, *weights)
+
+
+@contextlib.contextmanager
+def in_bf16(network: PwcNet):
+    """Within it levels match by their one operator, and convolve by the others."""
+    decoder, encoder = network.decoder, network.pyramid.encoder
+    plain = decoder.through
+    with fused(network):
+        for level in (decoder.shared, decoder.fine):
+            level.layers = lambda parts, level=level: chained(nn.Sequential(level.body, level.predict), parts, kept=True)
+        decoder.through = chained
+        # In the order of use; a unit registers its short cut last, which is where the operator looks for it.
+        parts = (encoder.conv1, encoder.layer1, encoder.layer2, encoder.layer3, encoder.conv2)
+        used = [p for part in parts for p in part.modules() if isinstance(p, nn.Conv2d)]
+        weights = [tensor for convolution in used for tensor in (convolution.weight, convolution.bias)]
+        middle = encoder.layer2[-1].conv3.out_channels
+        encoder.levels = lambda image: EncoderLevels.apply(image, middle, *weights)
+        try:
+            yield
+        finally:
+            del encoder.levels, decoder.shared.layers, decoder.fine.layers
+            decoder.through = plain
+
+
 class RaftFrameGraph(nn.Module):
     """RAFT-small's encoders: what is matched, and state and context."""
 
@@ -161,8 +236,8 @@ def traced(
 
 
 def graphs_of(network: nn.Module) -> dict[str, onnx.ModelProto]:
-    """`pyramid` and `decoder` graphs of a network in evaluation mode, and `fused`, the decoder with the node's own operator,
-    of a PWC-Net."""
+    """`pyramid` and `decoder` graphs of a network in evaluation mode; of a PWC-Net also `fused`, the decoder with the node's own
+    cost volume, and `pyramid_bf16` and `decoder_bf16` with its convolutions too."""
     graphs = (RaftFrameGraph, RaftPairGraph) if isinstance(network, RaftSmall) else (FrameGraph, PairGraph)
     frame, pair = (graph(network).eval() for graph in graphs)
     image = torch.rand(1, 3, GOLDEN_HEIGHT, GOLDEN_WIDTH)
@@ -173,10 +248,12 @@ def graphs_of(network: nn.Module) -> dict[str, onnx.ModelProto]:
         level = name[name.index("level") :]
         return {2: f"rows_{level}", 3: f"columns_{level}"}
 
-    pyramid = traced(
-        frame, (image,), ["image"], frame.names,
-        {"image": {2: "height", 3: "width"}, **{name: axes(name) for name in frame.names}},
-    )
+    def pyramid(domains: dict | None = None) -> onnx.ModelProto:
+        return traced(
+            frame, (image,), ["image"], frame.names,
+            {"image": {2: "height", 3: "width"}, **{name: axes(name) for name in frame.names}}, domains,
+        )
+
     raster = {1: "rows_level2", 2: "columns_level2"}
 
     def decoder(domains: dict | None = None) -> onnx.ModelProto:
@@ -185,10 +262,13 @@ def graphs_of(network: nn.Module) -> dict[str, onnx.ModelProto]:
             {"flow": raster, "uncertainty": raster, **{name: axes(name) for name in inputs}}, domains,
         )
 
-    graphs = {"pyramid": pyramid, "decoder": decoder()}
+    graphs = {"pyramid": pyramid(), "decoder": decoder()}
     if isinstance(network, PwcNet):
+        own = {DOMAIN: DOMAIN_VERSION}
         with fused(network):
-            graphs["fused"] = decoder({DOMAIN: DOMAIN_VERSION})
+            graphs["fused"] = decoder(own)
+        with in_bf16(network):
+            graphs |= {"pyramid_bf16": pyramid(own), "decoder_bf16": decoder(own)}
     return {part: with_half_weights(graph) for part, graph in graphs.items()}
 
 
@@ -319,7 +399,9 @@ def export(arguments: argparse.Namespace, network: nn.Module, state: dict, name:
     network.eval().load_state_dict(state["mean"])
     files = {}
     for part, graph in graphs_of(network).items():
-        file = {"pyramid": f"{arguments.name}_pyramid", "fused": f"{name}_decoder_fused"}.get(part, f"{name}_{part}")
+        # Those with the same weights share what looks at one frame.
+        owner = arguments.name if part.startswith("pyramid") else name
+        file = f"{owner}_{'decoder_fused' if part == 'fused' else part}"
         files[part] = arguments.models / f"{file}.onnx"
         onnx.checker.check_model(graph)
         written = graph.SerializeToString()

@@ -45,6 +45,11 @@ def conv(inputs: int, outputs: int, dilation: int = 1, size: int = 3) -> nn.Sequ
     )
 
 
+def through(layers: nn.Sequential, parts: list[torch.Tensor]) -> torch.Tensor:
+    """Layers that read several tensors as one. One operator in the bf16 graph of export.py."""
+    return layers(torch.cat(parts, 1))
+
+
 def cost_volume_plain(older: torch.Tensor, newer: torch.Tensor, reach: int = REACH) -> torch.Tensor:
     """Mean product of the features at every displacement of +-reach: [B, side^2, H, W], dy slow, dx fast. The definition."""
     height, width = older.shape[-2:]
@@ -154,13 +159,17 @@ class LevelDecoder(nn.Module):
         weights = torch.softmax(pooled * self.sharpness.exp(), 1)
         return volume * GAIN, torch.einsum("bdyx,cd->bcyx", weights, self.offsets)
 
+    def layers(self, parts):
+        """The residual in fp32, and the body's features. One operator in the bf16 graph of export.py."""
+        features = through(self.body, parts)
+        return self.predict(features).float(), features
+
     def forward(self, older, newer, context, flow, above, tile, fetch=True):
         """Flow [B, 2, H, W] and body features, from those of the level above at this level's size."""
         volume, argmax = self.match(older, newer, flow, tile, fetch)
         # Flow is of the size of a cost volume's reach, and larger at large motion only.
         parts = [volume, argmax.to(volume.dtype), context, (0.25 * flow).to(volume.dtype), above]
-        features = self.body(torch.cat(parts, 1))
-        residual = self.predict(features).float()
+        residual, features = self.layers(parts)
         return flow + residual[:, :2] + torch.sigmoid(residual[:, 2:]) * argmax, features
 
 
@@ -186,6 +195,7 @@ class Decoder(nn.Module):
         )
         self.fine = LevelDecoder(NARROW_REACH, QUARTER, DECODER_CHANNELS[-1], NARROW_CHANNELS)
         self.error, self.fast_error = error_head(), error_head()
+        self.through = through
 
     def forward(self, older, newer, fast: bool = False):
         matched = {3: (older[1], newer[1], older[2])}
@@ -202,13 +212,13 @@ class Decoder(nn.Module):
                 fetch = len(flows) > 0
                 flow, above = self.shared(*matched[level], flow, above, TILES.get(level), fetch)
                 flows.append(flow)
-        flows[-1] = flow = flow + self.context(torch.cat([above, (0.25 * flow).to(above.dtype)], 1)).float()
+        flows[-1] = flow = flow + self.through(self.context, [above, (0.25 * flow).to(above.dtype)]).float()
         flow = 2.0 * twice(flow)
-        coarser = F.softplus(self.fast_error(above.detach()).float()) + 0.01 if fast or self.training else None
+        coarser = F.softplus(self.through(self.fast_error, [above.detach()]).float()) + 0.01 if fast or self.training else None
         if fast:
             return [*flows, flow], twice(coarser)
         flow, features = self.fine(older[0], newer[0], older[0], flow, twice(above), TILES[2])
-        expected = F.softplus(self.error(features.detach()).float()) + 0.01
+        expected = F.softplus(self.through(self.error, [features.detach()]).float()) + 0.01
         return [*flows, flow], [coarser, expected] if self.training else expected
 
 

@@ -54,14 +54,15 @@ pub enum Provider {
     Acl,
 }
 
-/// In how many bits convolutions multiply. Inputs, outputs and our own operators are of 32 bits always.
+/// In how many bits convolutions multiply. Inputs, outputs and cost volumes are of 32 bits always.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
     /// 32 bits.
     #[default]
     Fp32,
-    /// 16 bits with the exponent of 32, by OpenVINO and TensorRT, on processors that have it.
+    /// 16 bits with the exponent of 32, on processors that have it: by the node's own operators and AMX with `cpu`, see
+    /// [`crate::flow::convolutions`], or by OpenVINO and TensorRT.
     Bf16,
     /// 16 bits, by TensorRT and ACL.
     Fp16,

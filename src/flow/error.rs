@@ -109,6 +109,12 @@ pub enum Error {
         /// What there is.
         able: String,
     },
+    /// The node's own operators can't compute in so many bits here.
+    #[error("[flow] precision = \"bf16\" with provider = \"cpu\": {reason}")]
+    Tiles {
+        /// Why not, and what to do.
+        reason: String,
+    },
     /// The network was not shown to be as good in so many bits.
     #[error(
         "[flow] precision = \"{}\": {network} was not shown to keep its error in it to 2 %, it runs in fp32; those that were: {able}",

@@ -27,6 +27,10 @@ pub struct Entry {
     pub decoder: File,
     /// The same decoder with the operators of [`crate::flow::cost_volume`], if there is one.
     pub fused: Option<File>,
+    /// The pyramid with the operators of [`crate::flow::convolutions`], if there is one.
+    pub pyramid_bf16: Option<File>,
+    /// The decoder with those and the cost volume's, if there is one.
+    pub decoder_bf16: Option<File>,
     /// Multiply-adds of all convolutions of a step, pyramid and decoder, at 320 × 256, in 10⁹; they grow with the area.
     pub gigamacs: Option<f64>,
     /// Fewer bits than 32 in which its end-point error was measured to stay within 2 % down the brightness ladder.

@@ -1,6 +1,8 @@
 //! Stage 3: two developed images become dense optical flow with a confidence for every vector.
 
+mod bands;
 mod config;
+pub mod convolutions;
 pub mod cost_volume;
 mod error;
 mod fake;
@@ -10,6 +12,7 @@ mod matcher;
 mod network;
 mod onnx;
 mod onnx_graph;
+mod operators;
 pub mod padding;
 mod provider;
 mod refine;

@@ -18,9 +18,10 @@ use ort::{
 use tracing::info;
 
 use crate::flow::{
-    Config, Error, Operators, Precision, Provider, cost_volume,
+    Config, Error, Operators, Precision, Provider, convolutions,
     manifest::{self, Kind},
     network::{Golden, Model, Network, Raster, Slot},
+    operators,
     padding::Padded,
     provider,
     runtime::{self, Tried},
@@ -155,7 +156,7 @@ impl Graph {
             .map_err(failed(doing))?
             .with_config_entry(provider::RECORD, "1")
             .map_err(failed(doing))?
-            .with_operators(cost_volume::domain().map_err(failed("make its operators"))?)
+            .with_operators(operators::domain().map_err(failed("make its operators"))?)
             .map_err(failed(doing))?
             .with_execution_providers(provider::wanted(config, library)?)
             .map_err(failed("start the execution provider"))?;
@@ -221,15 +222,34 @@ fn features(entry: &manifest::Entry, pyramid: &Graph, decoder: &Graph) -> Result
     Ok(given)
 }
 
-/// What computes the cost volumes; the entry's decoder becomes the graph for it.
-fn chosen(config: &Config, entry: &mut manifest::Entry) -> Operators {
-    if config.operators == Operators::Fused && config.provider != Provider::Cpu {
+/// What computes cost volumes and, in bf16, convolutions; the entry's graphs become those for it.
+fn chosen(config: &Config, entry: &mut manifest::Entry) -> Result<Operators, Error> {
+    let Config { operators, provider, precision, .. } = *config;
+    if provider == Provider::Cpu && precision == Precision::Bf16 {
+        let unfit = |reason: String| Error::Tiles { reason };
+        if operators == Operators::Plain {
+            return Err(unfit(
+                "it is computed by the node's own operators, which operators = \"plain\" forbids".into(),
+            ));
+        }
+        if !convolutions::Unit::best().is_fast() {
+            let reason = "it needs a processor with AMX (Intel's Xeons since 2023) and Linux 5.16 or newer, which this machine \
+                          hasn't; provider = \"openvino\" has it on processors with AVX-512, and fp32 runs anywhere";
+            return Err(unfit(reason.into()));
+        }
+        let Some((pyramid, decoder)) = entry.pyramid_bf16.take().zip(entry.decoder_bf16.take()) else {
+            return Err(unfit(format!("{} has no graphs for it; provider = \"openvino\" needs none", config.network)));
+        };
+        (entry.pyramid, entry.decoder) = (pyramid, decoder);
+        return Ok(Operators::Fused);
+    }
+    if operators == Operators::Fused && provider != Provider::Cpu {
         // Between two calls of our operator another provider's threads and the runtime's wait for each other, which costs
         // more than the operator saves.
-        info!("provider {:?} is given the whole decoder, with plain operators", config.provider);
-        return Operators::Plain;
+        info!("provider {provider:?} is given the whole decoder, with plain operators");
+        return Ok(Operators::Plain);
     }
-    match (config.operators, entry.fused.take()) {
+    Ok(match (operators, entry.fused.take()) {
         (Operators::Fused, Some(fused)) => {
             entry.decoder = fused;
             Operators::Fused
@@ -239,7 +259,7 @@ fn chosen(config: &Config, entry: &mut manifest::Entry) -> Operators {
             Operators::Plain
         }
         (Operators::Plain, _) => Operators::Plain,
-    }
+    })
 }
 
 impl Onnx {
@@ -257,7 +277,7 @@ impl Onnx {
             let able = able.map(|(name, _)| name).collect::<Vec<_>>().join(", ");
             return Err(Error::Coarse { network: config.network.clone(), precision, able });
         }
-        let operators = chosen(config, &mut entry);
+        let operators = chosen(config, &mut entry)?;
         let bytes = [manifest::read(&folder, &entry.pyramid)?, manifest::read(&folder, &entry.decoder)?];
         let open = |bytes: &[u8]| Graph::open(&loaded, bytes, config, None);
         let (pyramid, decoder) = (open(&bytes[0])?, open(&bytes[1])?);
@@ -268,7 +288,9 @@ impl Onnx {
         }
         provider::check(config, &assigned)?;
         let library = loaded.1.clone();
-        let provider = format!("{} of ONNX Runtime {}", provider::named(&assigned), provider::version(&library));
+        let tiles = config.provider == Provider::Cpu && precision == Precision::Bf16;
+        let tiles = if tiles { ", its convolutions the node's own, in bf16 by AMX" } else { "" };
+        let provider = format!("{} of ONNX Runtime {}{tiles}", provider::named(&assigned), provider::version(&library));
         let fixes = config.provider.fixes_sizes();
         let fixed = fixes.then(|| Fixed { loaded: loaded.clone(), config: config.clone(), bytes });
         let sha256 = [entry.pyramid, entry.decoder].into_iter().map(|file| (file.file, file.sha256)).collect();

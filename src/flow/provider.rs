@@ -80,8 +80,8 @@ impl Provider {
 
     fn precisions(self) -> &'static [Precision] {
         match self {
-            Provider::Cpu | Provider::Cuda | Provider::Xnnpack => &[Precision::Fp32],
-            Provider::OpenVino => &[Precision::Fp32, Precision::Bf16],
+            Provider::Cuda | Provider::Xnnpack => &[Precision::Fp32],
+            Provider::Cpu | Provider::OpenVino => &[Precision::Fp32, Precision::Bf16],
             Provider::TensorRt => &[Precision::Fp32, Precision::Bf16, Precision::Fp16],
             Provider::Acl => &[Precision::Fp32, Precision::Fp16],
         }

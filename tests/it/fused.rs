@@ -6,8 +6,10 @@ use nightflow::{
     clock::Stamp,
     exposure::{Exposed, Pair},
     flow::{
-        Config, Matcher, Operators, Own,
+        Config, Matcher, Operators, Own, Precision,
+        convolutions::Unit,
         cost_volume::{CostVolume, Inputs, Outputs, Shape, Unfit},
+        manifest::Entry,
     },
 };
 
@@ -183,6 +185,81 @@ fn a_fused_step_takes_no_more_memory_than_a_plain_one() {
             allocations::during(|| (0..5).for_each(|_| run())).1.calls
         });
         assert_eq!(taken[0], taken[1], "{network}");
+    }
+}
+
+/// How far apart flow in bf16 and in 32 bits may be where everything matches, in pixels: on average, and anywhere.
+const BF16_APART: [f32; 2] = [0.03, 0.5];
+
+/// Every network with graphs in bf16, that was judged in it.
+fn networks_in_bf16() -> Vec<String> {
+    let entries = nightflow::flow::manifest::entries(&models()).unwrap();
+    let able = |entry: &Entry| entry.decoder_bf16.is_some() && entry.precisions.contains(&Precision::Bf16);
+    let found: Vec<String> = entries.into_iter().filter(|(_, entry)| able(entry)).map(|(name, _)| name).collect();
+    assert!(!found.is_empty(), "no network of the manifest has graphs in bf16");
+    found
+}
+
+/// Opens a network in bf16; where there are no tiles for it, that must be said, and nothing is left to see.
+fn open_in_bf16(network: &str, threads: usize) -> Option<Matcher> {
+    let network = network.into();
+    let config = Config { network, models: models(), precision: Precision::Bf16, threads, ..Config::default() };
+    match (Matcher::open(&config), Unit::best().is_fast()) {
+        (Ok(matcher), true) => {
+            assert!(matcher.model().sha256.iter().all(|(file, _)| file.ends_with("_bf16.onnx")));
+            assert!(matcher.model().provider.ends_with("in bf16 by AMX"), "{}", matcher.model().provider);
+            Some(matcher)
+        }
+        (Err(error), false) => {
+            assert!(error.to_string().contains("it needs a processor with AMX"), "{error}");
+            None
+        }
+        (Ok(_), false) => panic!("opened without tiles"),
+        (Err(error), true) => panic!("{error}"),
+    }
+}
+
+#[test]
+fn bf16_gives_the_flow_of_32_bits_or_says_what_it_needs() {
+    let pairs = [
+        [golden(320, 256, 1, (0.0, 0.0)), golden(320, 256, 2, (2.0, 1.0))],
+        [waves(320, 256, 3, (0.0, 0.0)), waves(320, 256, 4, (-6.0, 4.0))],
+        [waves(150, 90, 5, (0.0, 0.0)), waves(150, 90, 6, (1.5, 0.5))],
+    ];
+    for network in networks_in_bf16() {
+        let Some(mut tiles) = open_in_bf16(&network, 2) else { continue };
+        let mut one_thread = open_in_bf16(&network, 1).unwrap();
+        let mut wide = open(&network, Operators::Fused, 2);
+        for pair in &pairs {
+            let (wanted, found) = (between(&mut wide, pair), between(&mut tiles, pair));
+            let apart: Vec<f32> = wanted.0.iter().zip(&found.0).map(|(a, b)| (a - b).abs()).collect();
+            let (mean, most) =
+                (apart.iter().sum::<f32>() / apart.len() as f32, apart.iter().copied().fold(0.0, f32::max));
+            println!("{network}, {} × {}: {mean:.4} px on average, {most:.3} at most", pair[0].width, pair[0].height);
+            assert!(mean < BF16_APART[0] && most < BF16_APART[1], "{network}: {mean} px on average, {most} at most");
+            assert!(
+                found == between(&mut tiles, pair) && found == between(&mut one_thread, pair),
+                "the same bits again"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_step_in_bf16_takes_no_more_memory_than_a_plain_one() {
+    let pair = [golden(192, 128, 1, (0.0, 0.0)), golden(192, 128, 2, (2.0, 1.0))];
+    let taken = |mut matcher: Matcher| {
+        let mut own = Own::default();
+        let mut run = || {
+            let [older, newer] = &pair;
+            matcher.between(&Pair { older, newer, gain_step: None }, &mut own).map(drop).unwrap();
+        };
+        (0..3).for_each(|_| run());
+        allocations::during(|| (0..5).for_each(|_| run())).1.calls
+    };
+    for network in networks_in_bf16() {
+        let Some(tiles) = open_in_bf16(&network, 2) else { continue };
+        assert_eq!(taken(tiles), taken(open(&network, Operators::Plain, 2)), "{network}");
     }
 }
 

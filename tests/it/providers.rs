@@ -6,7 +6,7 @@ use std::{
     process::{Command, Output},
 };
 
-use nightflow::flow::{Config, Matcher, Precision, Provider};
+use nightflow::flow::{Config, Matcher, Operators, Precision, Provider};
 
 use crate::{bags, peers};
 
@@ -33,8 +33,14 @@ fn a_provider_that_the_library_lacks_is_refused_with_what_to_do() {
 
 #[test]
 fn a_precision_is_refused_that_a_provider_lacks_or_a_network_was_not_judged_in() {
-    let error = refused(Config { precision: Precision::Bf16, ..Config::default() });
-    assert_eq!(error, "[flow] precision = \"bf16\": provider \"cpu\" can do fp32");
+    let error = refused(Config { precision: Precision::Fp16, ..Config::default() });
+    assert_eq!(error, "[flow] precision = \"fp16\": provider \"cpu\" can do fp32, bf16");
+    let plain = Config { precision: Precision::Bf16, operators: Operators::Plain, ..Config::default() };
+    let error = refused(plain);
+    assert!(
+        error.starts_with("[flow] precision = \"bf16\" with provider = \"cpu\": it is computed by the node's own"),
+        "{error}"
+    );
     let network = "raftsmall_fcdn".into();
     let error =
         refused(Config { provider: Provider::OpenVino, precision: Precision::Bf16, network, ..Config::default() });

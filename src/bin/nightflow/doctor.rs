@@ -77,6 +77,7 @@ fn processor() -> Finding {
         ("AVX-512", is_x86_feature_detected!("avx512f")),
         ("VNNI", is_x86_feature_detected!("avx512vnni")),
         ("BF16", is_x86_feature_detected!("avx512bf16")),
+        ("AMX", nightflow::flow::convolutions::Unit::best().is_fast()),
     ];
     #[cfg(target_arch = "aarch64")]
     let features = [("NEON", std::arch::is_aarch64_feature_detected!("neon"))];

@@ -12,16 +12,15 @@
 //! [`work`] does it in four, none of which takes memory, and [`operator`] lets ONNX Runtime call them. Every result is
 //! computed by one thread in a fixed order, so that it does not depend on how many threads there are.
 
-mod bands;
 mod lanes;
 mod operator;
 #[cfg(test)]
 mod tests;
 mod work;
 
-use bands::Bands;
+use crate::flow::bands::{self, Bands};
 pub use lanes::Unit;
-pub use operator::domain;
+pub use operator::Fused;
 use work::{Fetch, Multiply, Seek, Turn};
 
 /// The widest reach that [`CostVolume`] takes.

@@ -16,7 +16,7 @@ pub struct Turn<'a> {
     /// channels × height × width.
     pub newer: &'a [f32],
     /// One plane of height rows of width × depth.
-    pub to: Band<'a>,
+    pub to: Band<'a, f32>,
 }
 
 impl Work for Turn<'_> {
@@ -63,7 +63,7 @@ pub struct Fetch<'a> {
     /// 2 × height × width.
     pub flow: &'a [f32],
     /// One plane of height rows of channels × [`Shape::stride`]; the columns beside the image stay as they are.
-    pub to: Band<'a>,
+    pub to: Band<'a, f32>,
 }
 
 /// The four cells around a point: where their channels begin, and what they weigh.
@@ -156,7 +156,7 @@ pub struct Multiply<'a> {
     /// Room for [`Shape::scratch`] values.
     pub scratch: &'a mut [f32],
     /// One plane for each displacement.
-    pub volume: Band<'a>,
+    pub volume: Band<'a, f32>,
 }
 
 impl Work for Multiply<'_> {
@@ -279,7 +279,7 @@ pub struct Seek<'a> {
     /// Room for [`Shape::scratch`] values.
     pub scratch: &'a mut [f32],
     /// Two planes: right and down.
-    pub to: Band<'a>,
+    pub to: Band<'a, f32>,
 }
 
 impl Work for Seek<'_> {

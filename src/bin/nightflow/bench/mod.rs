@@ -15,7 +15,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use nightflow::{
     exposure::Exposed,
     flow::{
-        Config, Matcher, Operators, Resolution,
+        Config, Matcher, Operators, Precision, Provider, Resolution, convolutions,
         manifest::{self, Entry},
     },
 };
@@ -184,6 +184,14 @@ impl<'a> Bench<'a> {
         if fused { Operators::Fused } else { Operators::Plain }
     }
 
+    /// Whether a network runs in bf16 here, besides what the settings say.
+    fn has_tiles(&self, entry: &Entry) -> bool {
+        let Config { provider, precision, .. } = self.config;
+        let asked = provider == Provider::Cpu && precision == Precision::Fp32;
+        let judged = entry.decoder_bf16.is_some() && entry.precisions.contains(&Precision::Bf16);
+        asked && judged && convolutions::Unit::best().is_fast()
+    }
+
     /// Where in a round somebody's turn is: by network, refined before unrefined, fused, plain, then who is no network.
     fn place(&self, what: &What) -> (usize, usize) {
         let of = |network: &str| self.networks.iter().position(|(name, _)| name == network).unwrap_or(usize::MAX);
@@ -191,7 +199,8 @@ impl<'a> Bench<'a> {
             What::Refined(network) => (of(network), 0),
             What::Step(network, Operators::Fused) => (of(network), 1),
             What::Step(network, Operators::Plain) => (of(network), 2),
-            What::OpenVino(network, _) => (of(network), 3),
+            What::Tiles(network) => (of(network), 3),
+            What::OpenVino(network, _) => (of(network), 4),
             What::Sized(..) | What::Product | What::OpenCv(_) => (usize::MAX, 0),
         }
     }
@@ -210,6 +219,11 @@ impl<'a> Bench<'a> {
             for operators in fused.into_iter().chain([Operators::Plain]) {
                 let what = What::Step(network.clone(), operators);
                 turns.push(enter(what, &self.config(network, operators, threads), &frames, report)?);
+            }
+            if self.has_tiles(entry) {
+                let fused = self.config(network, Operators::Fused, threads);
+                let config = Config { precision: Precision::Bf16, ..fused };
+                turns.push(enter(What::Tiles(network.clone()), &config, &frames, report)?);
             }
         }
         let refined = Config { refine: true, ..self.config(&self.followed, self.operators(&self.followed), threads) };

@@ -13,6 +13,8 @@ use super::{
 
 /// What the fused operators are to reach against plain ones.
 const AIM_FUSED: f64 = 0.65;
+/// What the step in bf16 is to reach against plain operators.
+const AIM_BF16: f64 = 0.25;
 /// What our step is to reach against OpenVINO's in 32 bits.
 const AIM_OPENVINO: f64 = 0.8;
 /// The area that a network's multiply-adds are noted for.
@@ -124,12 +126,20 @@ impl Report {
         self.of(network, Operators::Fused).or_else(|| self.of(network, Operators::Plain))
     }
 
+    fn tiles(&self, network: &str) -> Option<&Times> {
+        self.steps.of(&What::Tiles(network.into()))
+    }
+
     fn step(&self, text: &mut String) {
         let aim = format!("fused / plain (aim {AIM_FUSED})");
-        heading(text, "The network's step", &["network", "fused, ms", "plain, ms", &aim]);
+        let fast = format!("bf16 / plain (aim {AIM_BF16})");
+        heading(text, "The network's step", &["network", "fused, ms", "plain, ms", &aim, "bf16, ms", &fast]);
         for (network, _) in &self.networks {
             let (fused, plain) = (self.of(network, Operators::Fused), self.of(network, Operators::Plain));
-            let _ = writeln!(text, "| {network} | {} | {} | {} |", ms(fused), ms(plain), ratio(fused, plain));
+            let tiles = self.tiles(network);
+            let ratios = [ratio(fused, plain), ratio(tiles, plain)];
+            let [fused, plain, tiles] = [fused, plain, tiles].map(ms);
+            let _ = writeln!(text, "| {network} | {fused} | {plain} | {} | {tiles} | {} |", ratios[0], ratios[1]);
         }
         let added = self.steps.of(&What::Refined(self.followed.clone())).zip(self.ours(&self.followed));
         let added = number(added.map(|(refined, ours)| refined.less(ours)), 2);
@@ -138,14 +148,21 @@ impl Report {
 
     fn beside(&self, text: &mut String, Beside { left_out, resident, .. }: &Beside) {
         let aim = format!("ours / it (aim {AIM_OPENVINO})");
-        let columns = ["network", "ours, ms", "OpenVINO fp32, ms", &aim, "OpenVINO bf16, ms", "ours / it"];
+        let columns = [
+            "network",
+            "ours, ms",
+            "OpenVINO fp32, ms",
+            &aim,
+            "ours in bf16, ms",
+            "OpenVINO bf16, ms",
+            "ours in bf16 / it",
+        ];
         heading(text, "The same weights in OpenVINO", &columns);
         for (network, _) in &self.networks {
-            let ours = self.ours(network);
-            let _ = write!(text, "| {network} | {} |", ms(ours));
-            for (_, bits) in BITS {
+            let _ = write!(text, "| {network} |");
+            for ((_, bits), ours) in BITS.into_iter().zip([self.ours(network), self.tiles(network)]) {
                 let rival = self.steps.of(&What::OpenVino(network.clone(), bits));
-                let _ = write!(text, " {} | {} |", ms(rival), ratio(ours, rival));
+                let _ = write!(text, " {} | {} | {} |", ms(ours), ms(rival), ratio(ours, rival));
             }
             text.push('\n');
         }
@@ -195,15 +212,20 @@ impl Report {
         let rate = |gigamacs: f64, times: &Times| 2e3 * gigamacs / times.median();
         for (network, entry) in &self.networks {
             let gigamacs = entry.gigamacs.map(|noted| noted * (width * height) as f64 / NOTED_AREA);
-            let known = gigamacs.zip(self.ours(network));
-            let part = known.zip(product).map(|((g, times), product)| g / Product::GIGAMACS * product.over(times));
-            let _ = writeln!(
-                text,
-                "| {network} | {} | {} | {} |",
-                number(gigamacs.map(|gigamacs| 2.0 * gigamacs), 2),
-                number(known.map(|(gigamacs, times)| rate(gigamacs, times)), 0),
-                number(part, 2)
-            );
+            for (bits, ours) in [("", self.ours(network)), (", bf16", self.tiles(network))] {
+                if ours.is_none() && !bits.is_empty() {
+                    continue;
+                }
+                let known = gigamacs.zip(ours);
+                let part = known.zip(product).map(|((g, times), product)| g / Product::GIGAMACS * product.over(times));
+                let _ = writeln!(
+                    text,
+                    "| {network}{bits} | {} | {} | {} |",
+                    number(gigamacs.map(|gigamacs| 2.0 * gigamacs), 2),
+                    number(known.map(|(gigamacs, times)| rate(gigamacs, times)), 0),
+                    number(part, 2)
+                );
+            }
         }
         let reached = number(product.map(|times| rate(Product::GIGAMACS, times)), 0);
         let _ = writeln!(

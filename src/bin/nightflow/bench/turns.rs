@@ -11,6 +11,8 @@ use nightflow::flow::Operators;
 pub enum What {
     /// Our step of a network.
     Step(String, Operators),
+    /// Our step of a network in bf16, by the processor's tiles.
+    Tiles(String),
     /// Our step of a network with its vectors refined.
     Refined(String),
     /// Our step of the network that costs are followed with, at a size, with so many threads.
@@ -27,6 +29,7 @@ impl fmt::Display for What {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             What::Step(network, operators) => write!(f, "{network}, {operators} operators"),
+            What::Tiles(network) => write!(f, "{network}, bf16"),
             What::Refined(network) => write!(f, "{network}, refined"),
             What::Sized([width, height], threads) => write!(f, "{width}×{height}, threads: {threads}"),
             What::Product => f.write_str("product of matrices"),

@@ -9,23 +9,23 @@ use std::{
 pub const MOST: usize = 64;
 
 /// Planes of `height` rows of `width` values, whose rows are handed out in bands, each of them once.
-pub struct Bands<'a> {
-    start: *mut f32,
+pub struct Bands<'a, T> {
+    start: *mut T,
     planes: usize,
     height: usize,
     width: usize,
     /// Rows of a band; the last may have fewer.
     rows: usize,
     taken: AtomicU64,
-    memory: PhantomData<&'a mut [f32]>,
+    memory: PhantomData<&'a mut [T]>,
 }
 
 // SAFETY: what a thread gets are bands, each handed out once, and no two bands share a row.
-unsafe impl Sync for Bands<'_> {}
+unsafe impl<T: Send> Sync for Bands<'_, T> {}
 
-impl<'a> Bands<'a> {
+impl<'a, T> Bands<'a, T> {
     /// Cuts `memory` into bands of so many rows, at most [`MOST`] of them.
-    pub fn new(memory: &'a mut [f32], [planes, height, width]: [usize; 3], rows: usize) -> Self {
+    pub fn new(memory: &'a mut [T], [planes, height, width]: [usize; 3], rows: usize) -> Self {
         assert!(
             planes * height * width <= memory.len() && height <= MOST * rows,
             "{planes} × {height} × {width}, {rows}"
@@ -34,7 +34,7 @@ impl<'a> Bands<'a> {
     }
 
     /// The band of this number; nothing if there is none or somebody has it already.
-    pub fn take(&self, number: usize) -> Option<Band<'_>> {
+    pub fn take(&self, number: usize) -> Option<Band<'_, T>> {
         let first = number.checked_mul(self.rows).filter(|first| *first < self.height)?;
         let bit = 1 << number;
         // Nothing else is told by this bit than whose the band is.
@@ -44,18 +44,18 @@ impl<'a> Bands<'a> {
 }
 
 /// Some rows of every plane.
-pub struct Band<'a> {
-    bands: &'a Bands<'a>,
+pub struct Band<'a, T> {
+    bands: &'a Bands<'a, T>,
     /// Its first row.
     pub first: usize,
     /// The row after its last.
     pub end: usize,
 }
 
-impl Band<'_> {
+impl<T> Band<'_, T> {
     /// A row of a plane.
     #[inline(always)]
-    pub fn row(&mut self, plane: usize, row: usize) -> &mut [f32] {
+    pub fn row(&mut self, plane: usize, row: usize) -> &mut [T] {
         let Bands { start, planes, height, width, .. } = *self.bands;
         assert!(plane < planes && row >= self.first && row < self.end);
         // SAFETY: the row lies within the memory that `Bands::new` borrowed for good and measured; it belongs to this band

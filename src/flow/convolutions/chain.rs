@@ -1,0 +1,120 @@
+//! Convolutions one after the other, from planes of f32 to planes of f32.
+
+use super::{
+    Spread,
+    layer::{Layer, To},
+    map::Map,
+    rows,
+    tiles::{Begun, Line, Unit, Work},
+};
+use crate::flow::bands::Band;
+
+/// The operator `nightflow::Convolutions` with its memory, which is taken at the first call of a size.
+#[derive(Debug)]
+pub struct Chain {
+    unit: Unit,
+    layers: Vec<Layer>,
+    /// What each layer reads.
+    maps: Vec<Map>,
+}
+
+/// What goes in: planes that are read as if they were one tensor after the other.
+pub type Parts<'a> = &'a [&'a [f32]];
+
+/// What does not fit.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("convolutions of {height} × {width}, {inputs} channels to {outputs}, can't have {found} values in and out")]
+pub struct Unfit {
+    height: usize,
+    width: usize,
+    inputs: usize,
+    outputs: usize,
+    found: String,
+}
+
+impl Chain {
+    /// Layers that keep the size, each with as many inputs as the one before has outputs; at least one.
+    pub fn new(unit: Unit, layers: Vec<Layer>) -> Self {
+        let maps = layers.iter().map(|_| Map::default()).collect();
+        Self { unit, layers, maps }
+    }
+
+    /// Channels that come out, and those of the layer before the last.
+    pub fn outputs(&self) -> [usize; 2] {
+        let mut back = self.layers.iter().rev().map(Layer::outputs);
+        [back.next().unwrap_or(0), back.next().unwrap_or(0)]
+    }
+
+    /// Computes everything, `before` being what the layer before the last gives, if that is wanted.
+    pub fn run<E: From<Unfit>>(
+        &mut self,
+        parts: Parts<'_>,
+        [height, width]: [usize; 2],
+        last: &mut [f32],
+        before: Option<&mut [f32]>,
+        spread: &impl Spread<E>,
+    ) -> Result<(), E> {
+        let (unit, cells) = (self.unit, height * width);
+        let inputs = self.layers.first().map_or(0, Layer::inputs);
+        let [outputs, kept] = self.outputs();
+        let sum: usize = parts.iter().map(|part| part.len()).sum();
+        let whole = parts.iter().all(|part| cells > 0 && part.len() % cells == 0) && sum == inputs * cells;
+        let fits = before.as_ref().is_none_or(|before| self.layers.len() > 1 && before.len() == kept * cells);
+        if !whole || last.len() != outputs * cells || !fits {
+            let found = format!("{sum}, {} and {:?}", last.len(), before.map(|before| before.len()));
+            return Err(Unfit { height, width, inputs, outputs, found }.into());
+        }
+        for (layer, map) in self.layers.iter().zip(&mut self.maps) {
+            map.resize([layer.inputs(), height, width], layer.margin());
+        }
+        let (rows, bands) = Map::bands(height);
+        let [first, ..] = &mut self.maps[..] else { return Ok(()) };
+        let (margin, depth) = (first.margin, first.depth());
+        let to = first.cut();
+        spread(bands, &|number| {
+            if let Some(to) = to.take(number) {
+                let rows = [number * rows, height.min((number + 1) * rows)];
+                unit.run(Pack { parts, cells, width, rows, margin, depth, to });
+            }
+        })?;
+        let (mut last, mut before) = (Some(last), before);
+        let count = self.layers.len();
+        for (index, layer) in self.layers.iter_mut().enumerate() {
+            let (read, written) = self.maps.split_at_mut(index + 1);
+            let planes = match count - index {
+                1 => last.take(),
+                2 => before.take(),
+                _ => None,
+            };
+            let to = To { map: written.first_mut(), planes, sums: None };
+            layer.run(unit, &read[index], to, spread)?;
+        }
+        Ok(())
+    }
+}
+
+/// Some rows of all parts become pixels.
+struct Pack<'a> {
+    parts: Parts<'a>,
+    cells: usize,
+    width: usize,
+    rows: [usize; 2],
+    margin: usize,
+    depth: usize,
+    to: Band<'a, Line>,
+}
+
+impl Work for Pack<'_> {
+    #[inline(always)]
+    fn on(mut self, begun: &Begun) {
+        let Self { parts, cells, width, rows, margin, depth, .. } = self;
+        for y in rows[0]..rows[1] {
+            let to = &mut self.to.row(0, y)[margin * depth..][..width * depth];
+            let mut planes = parts.iter().flat_map(|part| part.chunks_exact(cells));
+            for line in 0..depth {
+                let channels = std::array::from_fn(|_| planes.next().map(|plane| &plane[y * width..][..width]));
+                rows::pack(begun.has_vectors(), &channels, &mut to[line..], depth);
+            }
+        }
+    }
+}

@@ -1,0 +1,212 @@
+//! The operators as ONNX Runtime sees them. They spread their bands over the session's own threads.
+
+use std::ops::RangeInclusive;
+
+use ort::{
+    Error, Result,
+    operator::{ComputeContext, Kernel, KernelContext, Operator, OperatorInput, OperatorOutput},
+    value::TensorElementType,
+};
+
+use super::{CONVOLUTIONS, Chain, Encoder, Layer, Step, Unit, Weights, chain, encoder};
+use crate::flow::operators::{input, output, spread};
+
+const CHAIN: &str = "Convolutions";
+const ENCODER: &str = "Encoder";
+/// Smaller pictures than this are not worth waking other threads for.
+const CELLS_SPREAD_MIN: usize = 512;
+/// The most tensors that are read as one.
+const PARTS_MAX: usize = 8;
+/// The farthest apart that weights may lie.
+const DILATION_MAX: i64 = 64;
+
+impl From<chain::Unfit> for Error {
+    fn from(unfit: chain::Unfit) -> Self {
+        Error::new(unfit.to_string())
+    }
+}
+
+impl From<encoder::Unfit> for Error {
+    fn from(unfit: encoder::Unfit) -> Self {
+        Error::new(unfit.to_string())
+    }
+}
+
+/// `nightflow::Convolutions(part [1, C, H, W] …, weight [O, I, K, K], bias [O] …)`: the parts are read as if they were
+/// concatenated; each weight and bias is a layer that keeps the size. Attributes: how many `parts`, and for each layer one of
+/// `dilations` and of `slopes`, what negative results are multiplied with. Outputs: the last layer's and the one before's.
+pub struct Convolutions;
+
+/// `nightflow::Encoder(image [1, 3, H, W], weight, bias …)`: RAFT-small's feature encoder, convolutions in the order in which
+/// they are used. Outputs: the second layer's, and the last convolution's.
+pub struct Encode;
+
+/// A node of a graph.
+pub struct ChainNode {
+    parts: usize,
+    work: Chain,
+}
+
+/// A node of a graph.
+pub struct EncoderNode {
+    work: Encoder,
+}
+
+/// An input that does not change, and its shape.
+fn constant<'a>(attributes: &KernelContext<'a>, operator: &str, index: usize) -> Result<(Vec<usize>, Vec<f32>)> {
+    let value = attributes.constant_input::<ort::value::TensorValueType<f32>>(index);
+    let value = value.map_err(|e| Error::new(format!("{operator}: input {index} should be a constant: {e}")))?;
+    let (shape, values) = value.try_extract_tensor::<f32>()?;
+    Ok((shape.iter().map(|length| usize::try_from(*length).unwrap_or(0)).collect(), values.to_vec()))
+}
+
+/// A weight [O, I, rows, columns] and its bias.
+fn layer(attributes: &KernelContext<'_>, operator: &str, index: usize) -> Result<([usize; 4], Vec<f32>, Vec<f32>)> {
+    let (shape, weights) = constant(attributes, operator, index)?;
+    let (_, bias) = constant(attributes, operator, index + 1)?;
+    let wrong =
+        || Error::new(format!("{operator}: inputs {index} and {} are no weight and bias: {shape:?}", index + 1));
+    let shape: [usize; 4] = shape[..].try_into().map_err(|_| wrong())?;
+    let [outputs, inputs, rows, columns] = shape;
+    let sound = bias.len() == outputs && inputs > 0 && outputs > 0 && rows % 2 == 1 && columns % 2 == 1;
+    if sound { Ok((shape, weights, bias)) } else { Err(wrong()) }
+}
+
+impl Operator for Convolutions {
+    type Kernel<'attr> = ChainNode;
+
+    fn name(&self) -> &str {
+        CHAIN
+    }
+
+    fn versions(&self) -> RangeInclusive<u32> {
+        1..=1
+    }
+
+    fn inputs(&self) -> impl IntoIterator<Item = OperatorInput> {
+        [const { OperatorInput::variadic(3).homogenous(TensorElementType::Float32) }]
+    }
+
+    fn outputs(&self) -> impl IntoIterator<Item = OperatorOutput> {
+        [OperatorOutput::required(TensorElementType::Float32), OperatorOutput::optional(TensorElementType::Float32)]
+    }
+
+    fn create_kernel<'attr>(&self, attributes: &KernelContext<'attr>) -> Result<ChainNode> {
+        let dilations: Vec<i64> = attributes.get("dilations").unwrap_or_default();
+        let slopes: Vec<f32> = attributes.get("slopes").unwrap_or_default();
+        let parts: i64 = attributes.get("parts").unwrap_or(0);
+        let (inputs, outputs) = (attributes.inputs()?.len(), attributes.outputs()?.len());
+        let parts = usize::try_from(parts).unwrap_or(0);
+        let fits = inputs == parts + 2 * slopes.len() && dilations.len() == slopes.len() && slopes.len() >= outputs;
+        let within = |range: bool| fits && (1..=PARTS_MAX).contains(&parts) && outputs > 0 && range;
+        let sound =
+            dilations.iter().all(|d| (1..=DILATION_MAX).contains(d)) && slopes.iter().all(|s| (0.0..=1.0).contains(s));
+        if !within(sound) {
+            let found = format!("{inputs} inputs, {outputs} outputs, {parts} parts, {dilations:?}, {slopes:?}");
+            return Err(Error::new(format!("{CHAIN}: parts, dilations and slopes don't fit: {found}")));
+        }
+        let (mut layers, mut channels) = (vec![], None);
+        for (number, (dilation, slope)) in dilations.into_iter().zip(slopes).enumerate() {
+            let (shape, weights, bias) = layer(attributes, CHAIN, parts + 2 * number)?;
+            if channels.is_some_and(|channels| channels != shape[1]) {
+                let before = format!("{channels:?}");
+                return Err(Error::new(format!(
+                    "{CHAIN}: layer {number} should read {before} channels, it is {shape:?}"
+                )));
+            }
+            channels = Some(shape[0]);
+            let step = Step { stride: [1; 2], dilation: dilation as usize, slope };
+            layers.push(Layer::new(&weights, shape, &bias, step));
+        }
+        Ok(ChainNode { parts, work: Chain::new(Unit::best(), layers) })
+    }
+}
+
+/// Rows and columns of a tensor of one picture.
+fn size(lengths: &[i64]) -> Option<[usize; 2]> {
+    let [1, _, height, width] = *lengths else { return None };
+    Some([usize::try_from(height).ok()?, usize::try_from(width).ok()?])
+}
+
+/// Calls every piece of work, on the session's threads where that pays.
+fn shared(context: &ComputeContext, cells: usize, count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<()> {
+    if cells < CELLS_SPREAD_MIN {
+        (0..count).for_each(work);
+        return Ok(());
+    }
+    spread(context, count, work)
+}
+
+impl Kernel for ChainNode {
+    fn compute(&mut self, context: &ComputeContext) -> Result<()> {
+        let (first, lengths) = input(context, CHAIN, 0)?;
+        let wrong = |lengths: &[i64]| {
+            Error::new(format!("{CHAIN}: parts should be [1, C, H, W] of one size, one is {lengths:?}"))
+        };
+        let [height, width] = size(lengths).ok_or_else(|| wrong(lengths))?;
+        let mut parts = [first; PARTS_MAX];
+        for (index, part) in parts.iter_mut().enumerate().take(self.parts) {
+            let (values, lengths) = input(context, CHAIN, index)?;
+            if size(lengths) != Some([height, width]) {
+                return Err(wrong(lengths));
+            }
+            *part = values;
+        }
+        let [outputs, kept] = self.work.outputs();
+        let of = |channels: usize| [1, channels as i64, height as i64, width as i64];
+        let last = output(context, 0, of(outputs))?;
+        let before = if context.num_outputs()? > 1 { Some(output(context, 1, of(kept))?) } else { None };
+        let cells = height * width;
+        let spread = |count: usize, work: &(dyn Fn(usize) + Sync)| shared(context, cells, count, work);
+        self.work.run(&parts[..self.parts], [height, width], last, before, &spread)
+    }
+}
+
+impl Operator for Encode {
+    type Kernel<'attr> = EncoderNode;
+
+    fn name(&self) -> &str {
+        ENCODER
+    }
+
+    fn versions(&self) -> RangeInclusive<u32> {
+        1..=1
+    }
+
+    fn inputs(&self) -> impl IntoIterator<Item = OperatorInput> {
+        [const { OperatorInput::variadic(1 + 2 * CONVOLUTIONS).homogenous(TensorElementType::Float32) }]
+    }
+
+    fn outputs(&self) -> impl IntoIterator<Item = OperatorOutput> {
+        [const { OperatorOutput::required(TensorElementType::Float32) }; 2]
+    }
+
+    fn create_kernel<'attr>(&self, attributes: &KernelContext<'attr>) -> Result<EncoderNode> {
+        let inputs = attributes.inputs()?.len();
+        if inputs != 1 + 2 * CONVOLUTIONS {
+            return Err(Error::new(format!(
+                "{ENCODER}: {} inputs are needed, there are {inputs}",
+                1 + 2 * CONVOLUTIONS
+            )));
+        }
+        let layers = (0..CONVOLUTIONS).map(|number| layer(attributes, ENCODER, 1 + 2 * number));
+        let layers = layers.collect::<Result<Vec<_>>>()?;
+        let weights: Vec<Weights<'_>> =
+            layers.iter().map(|(shape, values, bias)| Weights { values, shape: *shape, bias }).collect();
+        Ok(EncoderNode { work: Encoder::new(Unit::best(), &weights)? })
+    }
+}
+
+impl Kernel for EncoderNode {
+    fn compute(&mut self, context: &ComputeContext) -> Result<()> {
+        let (image, lengths) = input(context, ENCODER, 0)?;
+        let wrong = || Error::new(format!("{ENCODER}: image should be [1, 3, H, W], it is {lengths:?}"));
+        let [height, width] = size(lengths).ok_or_else(wrong)?;
+        let channels = self.work.outputs();
+        let of = |channels: usize, part: usize| [1, channels, height / part, width / part].map(|length| length as i64);
+        let quarter = output(context, 0, of(channels[0], 4))?;
+        let eighth = output(context, 1, of(channels[1], 8))?;
+        let spread = |count: usize, work: &(dyn Fn(usize) + Sync)| shared(context, height * width, count, work);
+        self.work.run(image, [height, width], quarter, eighth, &spread)
+    }
+}
