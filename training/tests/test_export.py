@@ -85,6 +85,35 @@ def test_the_fused_decoder_is_called_alike_and_matches_by_the_one_operator(fresh
     assert reaches == [4, 4, 4, 4] + ([] if network.fast else [2])
 
 
+def test_the_bf16_graphs_are_called_alike_and_convolve_by_their_operators(fresh):
+    network, graphs, _ = fresh
+    if not isinstance(network, PwcNet):
+        assert not any("bf16" in part for part in graphs)
+        return
+    for part in ("pyramid", "decoder"):
+        plain, own = (onnx.load_from_string(graphs[name]) for name in (part, f"{part}_bf16"))
+        assert plain.graph.input == own.graph.input
+        assert [output.name for output in plain.graph.output] == [output.name for output in own.graph.output]
+        given = {node.op_type: node for node in own.graph.node if node.domain == "nightflow"}
+        chains = [node for node in own.graph.node if node.op_type == "Convolutions"]
+        # What is left of ONNX's own are the 1x1 projections behind the encoder.
+        assert sum(node.op_type == "Conv" for node in own.graph.node) == (2 if part == "pyramid" else 0)
+        if part == "pyramid":
+            assert set(given) == {"Encoder"} and len(given["Encoder"].input) == 1 + 2 * 22
+            continue
+        assert set(given) == {"CostVolume", "Convolutions"}
+        # Levels 5, 4, 3 and 3 again, the context network, level 2, a head for the expected error.
+        assert len(chains) == (6 if network.fast else 7)
+        of = lambda node, name: next(onnx.helper.get_attribute_value(a) for a in node.attribute if a.name == name)
+        assert [of(node, "parts") for node in chains[:5]] == [5, 5, 5, 5, 2]
+        assert of(chains[4], "dilations") == [1, 2, 4, 8, 1, 1]
+        assert np.allclose(of(chains[0], "slopes"), [0.1] * 5 + [1.0])
+        for node in chains:
+            assert len(node.input) == of(node, "parts") + 2 * len(of(node, "slopes"))
+    # Nothing of the tracing stays with the network.
+    network(*(torch.rand(1, 3, 64, 64) for _ in range(2)))[0][-1].sum().backward()
+
+
 def test_golden_frames_follow_their_formula():
     older, newer = golden_frames()
     c, y, x = 2, 50, 70
@@ -107,7 +136,8 @@ def test_committed_files_are_those_of_the_manifest():
     manifest = tomllib.loads((MODELS / "manifest.toml").read_text())
     assert manifest
     for entry in manifest.values():
-        paths = {part: MODELS / entry[part]["file"] for part in ("pyramid", "decoder", "fused") if part in entry}
+        parts = ("pyramid", "decoder", "fused", "pyramid_bf16", "decoder_bf16")
+        paths = {part: MODELS / entry[part]["file"] for part in parts if part in entry}
         for part, path in paths.items():
             assert hashlib.sha256(path.read_bytes()).hexdigest() == entry[part]["sha256"]
             assert path.stat().st_size <= 20_000_000

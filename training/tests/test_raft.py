@@ -2,8 +2,9 @@
 
 import pytest
 import torch
+import torch.nn.functional as F
 
-from raft import HIDDEN, LEVELS, RADIUS, SIDE, RaftSmall
+from raft import HIDDEN, LEVELS, RADIUS, SIDE, RaftSmall, instance_norm
 
 
 def test_shapes_and_every_parameter_learns():
@@ -65,3 +66,16 @@ def test_published_weights_fit_or_are_refused(tmp_path):
     torch.save(state, tmp_path / "lacks.pth")
     with pytest.raises(ValueError, match="fnet.conv1.weight"):
         network.published(tmp_path / "lacks.pth")
+
+
+def test_the_norm_that_is_compiled_is_the_operator(monkeypatch):
+    x = (3 * torch.randn(2, 5, 12, 20) + 7).requires_grad_()
+    weight = torch.randn(2, 5, 12, 20)
+    results = []
+    for compiling in (False, True):
+        monkeypatch.setattr(torch.compiler, "is_compiling", lambda compiling=compiling: compiling)
+        y = instance_norm(x)
+        results.append((y, *torch.autograd.grad((y * weight).sum(), x)))
+    assert torch.allclose(results[1][0], F.instance_norm(x), atol=1e-5)
+    for plain, written in zip(*results):
+        assert torch.allclose(plain, written, atol=1e-5)

@@ -37,6 +37,18 @@ def steps(run: Run, textures: Textures, count: int) -> None:
         run.train_step(*batch_of(textures, crop["height"], crop["width"], run.noise(crop["batch"])))
 
 
+def test_a_run_starts_from_the_graphs_of_a_network():
+    name = Path(__file__).parents[2] / "models" / "pwcnet_fcdn"
+    held = checkpoints.of_graphs(name)
+    run = Run(DESCRIPTION | {"start": str(name)})
+    for key, value in run.network.state_dict().items():
+        assert torch.equal(value, held[key]), key
+    with pytest.raises(ValueError, match="is unknown"):
+        Run(DESCRIPTION | {"network": "raftsmall", "iterations": 1, "start": str(name)})
+    with pytest.raises(FileNotFoundError, match="pwcnet_none"):
+        Run(DESCRIPTION | {"start": str(name.with_name("pwcnet_none"))})
+
+
 def test_resumed_equals_straight_through(packed, tmp_path, one_thread):
     textures = Textures(packed, held_out=False)
     straight = Run(DESCRIPTION)
