@@ -274,7 +274,8 @@ impl Onnx {
         if precision != Precision::Fp32 && !entry.precisions.contains(&precision) {
             let able =
                 manifest::entries(&folder)?.into_iter().filter(|(_, entry)| entry.precisions.contains(&precision));
-            let able = able.map(|(name, _)| name).collect::<Vec<_>>().join(", ");
+            let able: Vec<String> = able.map(|(name, _)| name).collect();
+            let able = if able.is_empty() { "none".into() } else { able.join(", ") };
             return Err(Error::Coarse { network: config.network.clone(), precision, able });
         }
         let operators = chosen(config, &mut entry)?;

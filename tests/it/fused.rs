@@ -17,7 +17,7 @@ use crate::allocations::{self, Allocations};
 
 /// How far a fused graph's flow and confidence may lie from the plain one's, in pixels.
 const APART: f32 = 1e-4;
-/// The same where nothing matches anything: there a network makes much of the last digits.
+/// The same where nothing matches anything, or everything does: there a network makes much of the last digits.
 const APART_IN_NOISE: f32 = 5e-4;
 /// The same for vectors of more than ten pixels, as a part of them: floats have no more than seven digits.
 const APART_PART: f32 = 1e-5;
@@ -102,7 +102,8 @@ fn between(matcher: &mut Matcher, [older, newer]: &[Exposed; 2]) -> (Vec<f32>, V
 
 #[test]
 fn a_fused_graph_gives_the_plain_ones_flow() {
-    let mut pairs = vec![(APART, [golden(192, 128, 1, (0.0, 0.0)), golden(192, 128, 2, (2.0, 1.0))])];
+    // A picture of one wave matches all along it, a period further on, too.
+    let mut pairs = vec![(APART_IN_NOISE, [golden(192, 128, 1, (0.0, 0.0)), golden(192, 128, 2, (2.0, 1.0))])];
     // Far more than the finest levels reach, so that the coarse ones fetch from far and from outside.
     pairs.push((APART, [waves(320, 256, 3, (0.0, 0.0)), waves(320, 256, 4, (-23.0, 17.0))]));
     for (number, (width, height)) in [(64, 64), (128, 64), (150, 90), (320, 256), (64, 448)].into_iter().enumerate() {
@@ -189,7 +190,7 @@ fn a_fused_step_takes_no_more_memory_than_a_plain_one() {
 }
 
 /// How far apart flow in bf16 and in 32 bits may be where everything matches, in pixels: on average, and anywhere.
-const BF16_APART: [f32; 2] = [0.03, 0.5];
+const BF16_APART: [f32; 2] = [0.01, 0.5];
 
 /// Every network with graphs in bf16, that was judged in it.
 fn networks_in_bf16() -> Vec<String> {
@@ -222,7 +223,7 @@ fn open_in_bf16(network: &str, threads: usize) -> Option<Matcher> {
 #[test]
 fn bf16_gives_the_flow_of_32_bits_or_says_what_it_needs() {
     let pairs = [
-        [golden(320, 256, 1, (0.0, 0.0)), golden(320, 256, 2, (2.0, 1.0))],
+        [waves(320, 256, 1, (0.0, 0.0)), waves(320, 256, 2, (2.0, 1.0))],
         [waves(320, 256, 3, (0.0, 0.0)), waves(320, 256, 4, (-6.0, 4.0))],
         [waves(150, 90, 5, (0.0, 0.0)), waves(150, 90, 6, (1.5, 0.5))],
     ];

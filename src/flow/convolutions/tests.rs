@@ -3,6 +3,7 @@
 use std::convert::Infallible;
 
 use proptest::prelude::*;
+use rayon::prelude::*;
 
 use super::{
     encoder::Unfit,
@@ -107,13 +108,9 @@ fn backwards(count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<(), Infallib
     Ok(())
 }
 
-/// Two threads.
+/// On as many threads as there are.
 fn shared(count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<(), Infallible> {
-    std::thread::scope(|scope| {
-        for half in 0..2 {
-            scope.spawn(move || (half..count).step_by(2).for_each(work));
-        }
-    });
+    (0..count).into_par_iter().for_each(work);
     Ok(())
 }
 
