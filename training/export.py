@@ -14,6 +14,7 @@ import torch
 from torch import nn
 
 import checkpoints
+from flownet import KINDS, FlowNet
 from networks import GAIN, PwcNet
 from raft import RaftSmall
 
@@ -193,6 +194,37 @@ class RaftPairGraph(nn.Module):
         return flows[-1].permute(0, 2, 3, 1) * scale, expected[:, 0]
 
 
+class FlowNetFrameGraph(nn.Module):
+    """What concerns one frame alone: FlowNetS's halves of a layer, or FlowNetC's level 2 and what is matched."""
+
+    def __init__(self, network: FlowNet):
+        super().__init__()
+        self.pyramid, self.names = network.pyramid, network.features
+
+    def forward(self, image):
+        return self.pyramid(image)
+
+
+class FlowNetPairGraph(nn.Module):
+    """The rest, in the order in which the decoder takes it."""
+
+    def __init__(self, network: FlowNet):
+        super().__init__()
+        self.decoder, self.names = network.decoder, network.reads
+
+    def forward(self, *inputs):
+        *features, scale = inputs
+        flows, expected = self.decoder(*features)
+        return flows[-1].permute(0, 2, 3, 1) * scale, expected[:, 0]
+
+
+GRAPHS = {
+    PwcNet: (FrameGraph, PairGraph),
+    RaftSmall: (RaftFrameGraph, RaftPairGraph),
+    FlowNet: (FlowNetFrameGraph, FlowNetPairGraph),
+}
+
+
 def golden_frames() -> tuple[np.ndarray, np.ndarray]:
     """Two frames [1, 3, 128, 192] by formula, the second moved by (2, 1) pixels."""
 
@@ -238,7 +270,7 @@ def traced(
 def graphs_of(network: nn.Module) -> dict[str, onnx.ModelProto]:
     """`pyramid` and `decoder` graphs of a network in evaluation mode; of a PWC-Net also `fused`, the decoder with the node's own
     cost volume, and `pyramid_bf16` and `decoder_bf16` with its convolutions too."""
-    graphs = (RaftFrameGraph, RaftPairGraph) if isinstance(network, RaftSmall) else (FrameGraph, PairGraph)
+    graphs = next(graphs for kind, graphs in GRAPHS.items() if isinstance(network, kind))
     frame, pair = (graph(network).eval() for graph in graphs)
     image = torch.rand(1, 3, GOLDEN_HEIGHT, GOLDEN_WIDTH)
     features = dict(zip(frame.names, frame(image)))
@@ -323,6 +355,13 @@ def moved(height: int, width: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.ascontiguousarray(picture[:, :, y : y + height, x : x + width]) for y, x in ((4, 4), (2, 1)))
 
 
+def macs(node: onnx.NodeProto, kernel: list[int]) -> float:
+    """Multiply-adds for each cell that comes out of a convolution: every weight is multiplied once for it, or, in a
+    transposed one, once for each cell that goes in."""
+    strides = next(list(a.ints) for a in node.attribute if a.name == "strides")
+    return np.prod(kernel) / (np.prod(strides) if node.op_type == "ConvTranspose" else 1)
+
+
 def gigamacs(pyramid: Path, decoder: Path) -> float:
     """Multiply-adds of the convolutions of a step at 320 x 256, in 10^9: the shapes are asked of ONNX Runtime."""
     total, values = 0, {"image": np.zeros((1, 3, 256, 320), np.float32), "scale": np.ones(2, np.float32)}
@@ -331,15 +370,14 @@ def gigamacs(pyramid: Path, decoder: Path) -> float:
         weights = {tensor.name: tensor.dims for tensor in model.graph.initializer}
         # Weights of half as many bits stand behind a cast.
         weights |= {n.output[0]: weights[n.input[0]] for n in model.graph.node if n.input and n.input[0] in weights}
-        convolutions = {n.output[0]: weights[n.input[1]] for n in model.graph.node if n.op_type == "Conv"}
+        convolutions = {n.output[0]: macs(n, weights[n.input[1]]) for n in model.graph.node if "Conv" in n.op_type}
         names = [output.name for output in model.graph.output]
         for name in convolutions.keys() - set(names):
             model.graph.output.append(onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, None))
         session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
         outputs = dict(zip((o.name for o in session.get_outputs()),
                            session.run(None, {i.name: values[i.name] for i in session.get_inputs()})))
-        # Every weight is multiplied once for each of the cells that come out.
-        total += sum(int(np.prod(kernel)) * outputs[name][0, 0].size for name, kernel in convolutions.items())
+        total += sum(each * outputs[name][0, 0].size for name, each in convolutions.items())
         values |= {f"{frame}_{name}": outputs[name] for frame in FRAMES for name in names}
     return total / 1e9
 
@@ -389,6 +427,8 @@ def main() -> None:
         export(arguments, PwcNet(), state, arguments.name)
         if arguments.fast:
             export(arguments, PwcNet(fast=True), state, f"{arguments.name}_fast")
+    if state["kind"] in KINDS:
+        export(arguments, KINDS[state["kind"]](state["width"]), state, arguments.name)
     for iterations in arguments.iterations or []:
         first = iterations == arguments.iterations[0]
         export(arguments, RaftSmall(iterations), state, arguments.name if first else f"{arguments.name}_{iterations}")

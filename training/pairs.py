@@ -1,5 +1,7 @@
-"""Pairs for training and judging: clean scenes made into dark raw frames by the FCDN recipe `paper`."""
+"""Pairs for training and judging: clean scenes made into dark raw frames by the FCDN recipe `paper` or one of its
+rivals."""
 
+import math
 import struct
 import subprocess
 from pathlib import Path
@@ -12,6 +14,18 @@ from scenes import MIXTURE, Textures, scene, uniform
 
 MEAN_LEVEL = 0.4
 DARKEST = 30.0
+# As `nightflow synth fcdn` names them.
+RECIPES = ("paper", "authors-2021", "unprocess")
+# From CIE XYZ to the colours of four cameras; the figures are those published with `unprocess`
+# (google-research/unprocessing, Apache-2.0).
+XYZ_TO_CAMERA = (
+    ((1.0234, -0.2969, -0.2266), (-0.5625, 1.6328, -0.0469), (-0.0703, 0.2188, 0.6406)),
+    ((0.4913, -0.0541, -0.0202), (-0.613, 1.3513, 0.2906), (-0.1564, 0.2151, 0.7183)),
+    ((0.838, -0.263, -0.0639), (-0.2887, 1.0725, 0.2496), (-0.0627, 0.1427, 0.5438)),
+    ((0.6596, -0.2079, -0.0562), (-0.4782, 1.3016, 0.1933), (-0.097, 0.1581, 0.5181)),
+)
+# From linear sRGB to CIE XYZ, white D65.
+RGB_TO_XYZ = ((0.4124564, 0.3575761, 0.1804375), (0.2126729, 0.7151522, 0.0721750), (0.0193339, 0.1191920, 0.9503041))
 
 
 def levels(batch: int, darkest: float = DARKEST, towards_bright: float = 1.0) -> torch.Tensor:
@@ -47,11 +61,70 @@ def noisy(first: torch.Tensor, second: torch.Tensor, level: float | torch.Tensor
     return tuple((y + torch.randn_like(y) * torch.sqrt(a * y + b)).clamp(0, 1) for y in (first, second))
 
 
-def batch_of(textures: Textures, height: int, width: int, level: torch.Tensor | None, mixture=MIXTURE, batch: int = 4):
-    """A training batch: older, newer [B, 3, H, W] and the flow [B, 2, H, W]; one pair for each noise level, or `batch`
-    clean ones."""
+def over_pixels(values: torch.Tensor) -> torch.Tensor:
+    """[B] or [B, 3], one for a pair or one for each of its colours, as [B, 1 or 3, 1, 1]."""
+    return values.view(len(values), -1, 1, 1)
+
+
+def authors_drawn(batch: int):
+    """The authors' released script of 2021: deviation by signal a [B], deviation in the dark b [B] on the 8-bit scale,
+    and a gain for each colour [B, 3]."""
+    a, b = (torch.randn(batch) * 19.5 / 255).abs(), (torch.randn(batch) * 38.25).abs()
+    return a, b, 1 / (1 + 0.05 * torch.randn(batch, 3))
+
+
+def authors(first, second, a, b, gain):
+    """z ~ N(x, (a x + b)^2) on the 8-bit scale, cut to a whole number; times the gain, cut again."""
+
+    def seen(frame):
+        x = (255 * frame).round()
+        z = (x + (over_pixels(a) * x + over_pixels(b)) * torch.randn_like(x)).clamp(0, 255).trunc()
+        return (over_pixels(gain) * z).clamp(0, 255).trunc() / 255
+
+    return seen(first), seen(second)
+
+
+def unprocess_drawn(batch: int):
+    """Brooks et al. 2019: from linear sRGB to the colours of a camera between four [B, 3, 3], gains that undo the white
+    balance [B, 3], and noise a [B] and b [B] as in `noisy`."""
+    weights = uniform(batch * len(XYZ_TO_CAMERA), 1e-8, 1.0).view(batch, -1)
+    matrix = torch.einsum("bk,kix,xj->bij", weights, torch.tensor(XYZ_TO_CAMERA), torch.tensor(RGB_TO_XYZ))
+    brightness = 0.8 + 0.1 * torch.randn(batch)
+    gain = torch.stack([brightness / uniform(batch, 1.9, 2.4), brightness, brightness / uniform(batch, 1.5, 1.9)], 1)
+    ln_a = uniform(batch, math.log(0.0001), math.log(0.012))
+    ln_b = 2.18 * ln_a + 1.20 + 0.26 * torch.randn(batch)
+    return matrix / matrix.sum(2, keepdim=True), gain, ln_a.exp(), ln_b.exp()
+
+
+def unprocess(first, second, matrix, gain, a, b):
+    """Tone curve, power, colours and white balance undone, the last but for highlights; then z ~ N(y, a y + b), clipped
+    and rounded to a byte."""
+    gain = over_pixels(gain)
+
+    def seen(frame):
+        linear = (0.5 - torch.sin(torch.asin(1 - 2 * frame.clamp(0, 1)) / 3)).clamp(min=0) ** 2.2
+        colours = torch.einsum("bij,bjyx->biyx", matrix, linear)
+        light = ((colours.mean(1, keepdim=True) - 0.9) / 0.1).clamp(min=0) ** 2
+        y = (colours * torch.maximum(light + (1 - light) * gain, gain)).clamp(0, 1)
+        z = y + torch.sqrt(over_pixels(a) * y + over_pixels(b)) * torch.randn_like(y)
+        return (255 * z.clamp(0, 1)).round() / 255
+
+    return seen(first), seen(second)
+
+
+def batch_of(
+    textures: Textures, height: int, width: int, level: torch.Tensor | None, mixture=MIXTURE, batch: int = 4,
+    recipe: str = "paper",
+):
+    """A training batch: older, newer [B, 3, H, W] and the flow [B, 2, H, W]. By the recipe `paper` one pair for each
+    noise level, or `batch` clean ones; the others draw their own noise for `batch` pairs, and what they make is not
+    brought to a mean."""
     batch = batch if level is None else len(level)
     first, second, flow = scene(textures, batch, height, width, mixture)
+    if recipe == "authors-2021":
+        return *authors(first, second, *authors_drawn(batch)), flow
+    if recipe == "unprocess":
+        return *unprocess(first, second, *unprocess_drawn(batch)), flow
     first, second = linear(first, second)
     if level is not None:
         first, second = noisy(first, second, level)

@@ -16,8 +16,9 @@ import torch.nn.functional as F
 from torch import nn
 
 import checkpoints
+from flownet import KINDS
 from networks import PwcNet
-from pairs import DARKEST, HeldOut, batch_of, levels
+from pairs import DARKEST, RECIPES, HeldOut, batch_of, levels
 from raft import RaftSmall
 from scenes import MIXTURE, Textures
 
@@ -31,7 +32,9 @@ def network_of(description: dict) -> nn.Module:
         return PwcNet()
     if kind == "raftsmall":
         return RaftSmall(description["iterations"])
-    raise ValueError(f"expected the network pwcnet or raftsmall, found {kind}")
+    if kind in KINDS:
+        return KINDS[kind](description["width"])
+    raise ValueError(f"expected the network pwcnet, raftsmall, {' or '.join(KINDS)}, found {kind}")
 
 
 def start(network: nn.Module, where: str) -> None:
@@ -86,6 +89,10 @@ class Run:
 
     def __init__(self, description: dict):
         self.description = description
+        # Clean pairs are those of the recipe `paper` without its noise.
+        self.recipe = "paper" if description["clean"] else description.get("recipe", "paper")
+        if self.recipe not in RECIPES:
+            raise ValueError(f"expected the recipe {', '.join(RECIPES[:-1])} or {RECIPES[-1]}, found {self.recipe}")
         torch.manual_seed(description["seed"])
         # Made on the CPU, so that a seed means the same weights on every kind of machine.
         with torch.device("cpu"):
@@ -133,8 +140,8 @@ class Run:
         return [c for c in self.description["crops"] if c["from"] <= self.progress()][-1]
 
     def noise(self, batch: int) -> torch.Tensor | None:
-        """Noise levels for a batch; none for a clean run."""
-        if self.description["clean"]:
+        """Noise levels for a batch of the recipe `paper`; none for a clean run."""
+        if self.description["clean"] or self.recipe != "paper":
             return None
         return levels(batch, self.description.get("darkest", DARKEST), self.description.get("towards_bright", 1.0))
 
@@ -177,6 +184,7 @@ class Run:
             "moments": {i: {n: narrow(n, v) for n, v in m.items()} for i, m in optimizer["state"].items()},
             "random": torch.get_rng_state(),
             "kind": self.description["network"],
+            "width": self.description.get("width"),
             "step": self.step,
             "seconds": self.seconds,
         }
@@ -243,10 +251,11 @@ def leg(run: Run, folder: Path, packed: Path, minutes: float, every: float) -> N
         # One step in fifty is timed part by part; the others are not waited for.
         timed = first and run.step % 50 == 20
         start = waited(run.device) if timed else 0.0
-        pairs = batch_of(textures, crop["height"], crop["width"], run.noise(crop["batch"]), mixture, crop["batch"])
+        size, batch = (crop["height"], crop["width"]), crop["batch"]
+        pairs = batch_of(textures, *size, run.noise(batch), mixture, batch, run.recipe)
         made = waited(run.device) if timed else 0.0
         losses.append(run.train_step(*pairs))
-        counted += crop["batch"]
+        counted += batch
         if timed:
             end = waited(run.device)
             share, now = (made - start) / (end - start), time.monotonic()

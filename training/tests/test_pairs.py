@@ -10,7 +10,8 @@ import torch.nn.functional as F
 from PIL import Image
 
 import scenes
-from pairs import HeldOut, MEAN_LEVEL, Stream, linear, noisy, public_pairs, read_flo
+from pairs import (MEAN_LEVEL, RECIPES, HeldOut, Stream, authors, authors_drawn, batch_of, linear, noisy, public_pairs,
+                   read_flo, unprocess, unprocess_drawn)
 from scenes import Textures, homographies, mapped, scene
 
 
@@ -151,3 +152,95 @@ def test_pairs_in_the_layout_of_flyingchairs_are_read(tmp_path):
         Image.fromarray(np.full((2, 3, 3), 60 * i, np.uint8)).save(tmp_path / f"00001_img{i}.ppm")
     ((name, older, newer, read),) = public_pairs(tmp_path)
     assert name == "00001" and read.shape == (1, 2, 2, 3) and (newer == 2 * older).all()
+
+
+@pytest.mark.parametrize("grey", [0, 60, 200])
+def test_the_authors_noise_has_the_moments_of_its_definition(grey):
+    torch.manual_seed(0)
+    a, b, gain = torch.tensor([0.0, 0.02]), torch.tensor([4.0, 3.0]), torch.tensor([[1.0, 0.9137, 1.0713]] * 2)
+    clean = torch.full((2, 3, 256, 256), grey / 255)
+    older, newer = authors(clean, clean, a, b, gain)
+    draws = torch.linspace(-6, 6, 20001, dtype=torch.double)
+    weights = torch.exp(-(draws**2) / 2) / torch.exp(-(draws**2) / 2).sum()
+    for pair in range(2):
+        for colour in range(3):
+            # The definition, cut for cut, summed over the normal curve.
+            seen = (grey + (a[pair] * grey + b[pair]).double() * draws).clamp(0, 255).trunc()
+            seen = (seen * gain[pair, colour]).clamp(0, 255).trunc()
+            mean = (weights * seen).sum()
+            variance = (weights * (seen - mean) ** 2).sum()
+            for frame in (older, newer):
+                values = 255 * frame[pair, colour].double()
+                assert (values - values.round()).abs().max() < 1e-4
+                assert abs(values.mean() - mean) < 5 * (variance / values.numel()).sqrt() + 1e-3
+                assert values.var() == pytest.approx(variance.item(), rel=0.04)
+    assert not torch.equal(older, newer)
+
+
+def test_the_authors_figures_are_drawn_as_they_said():
+    torch.manual_seed(0)
+    a, b, gain = authors_drawn(20000)
+    # The mean of |N(0, s)| is s times the root of 2/pi.
+    for values, deviation in ((a, 19.5 / 255), (b, 38.25)):
+        assert values.min() >= 0 and values.mean() == pytest.approx(deviation * (2 / np.pi) ** 0.5, rel=0.02)
+    assert gain.shape == (20000, 3) and (1 / gain).mean() == pytest.approx(1, abs=2e-3)
+    assert (1 / gain).std() == pytest.approx(0.05, rel=0.02)
+
+
+@pytest.mark.parametrize("grey", [120, 200])
+def test_unprocessed_greys_have_the_moments_of_the_definition(grey):
+    torch.manual_seed(0)
+    matrix, gain, _, _ = unprocess_drawn(2)
+    a, b = torch.tensor([1e-3, 2e-3]), torch.tensor([1e-5, 4e-5])
+    clean = torch.full((2, 3, 256, 256), grey / 255)
+    frames = unprocess(clean, clean, matrix, gain, a, b)
+    # By halving, where the code has a closed form: the x of 3 x^2 - 2 x^3 = y.
+    low, high = 0.0, 1.0
+    for _ in range(50):
+        middle = (low + high) / 2
+        low, high = (middle, high) if middle * middle * (3 - 2 * middle) < grey / 255 else (low, middle)
+    for pair in range(2):
+        for colour in range(3):
+            # A camera's rows sum to one, so that a grey stays the same grey.
+            mean = low**2.2 * gain[pair, colour].item()
+            variance = (a[pair] * mean + b[pair]).item() + 1 / 12 / 255**2
+            assert mean - 4 * variance**0.5 > 0, "nothing is clipped"
+            for frame in frames:
+                values = frame[pair, colour].double()
+                assert abs(values.mean() - mean) < 5 * (variance / values.numel()) ** 0.5
+                assert values.var() == pytest.approx(variance, rel=0.04)
+    assert not torch.equal(*frames)
+
+
+def test_unprocessed_highlights_stay_white():
+    white = torch.ones(1, 3, 4, 4)
+    matrix, gain, *_ = unprocess_drawn(1)
+    frames = unprocess(white, white, matrix, gain, torch.zeros(1), torch.zeros(1))
+    assert all((frame == 1).all() for frame in frames)
+
+
+def test_unprocess_draws_cameras_gains_and_noise_of_the_published_ranges():
+    torch.manual_seed(0)
+    matrix, gain, a, b = unprocess_drawn(20000)
+    torch.testing.assert_close(matrix.sum(2), torch.ones(20000, 3))
+    own = matrix.diagonal(dim1=1, dim2=2)
+    assert 0.4 < own.min() and own.max() < 1.2
+    assert gain[:, 1].mean() == pytest.approx(0.8, abs=3e-3) and gain[:, 1].std() == pytest.approx(0.1, rel=0.02)
+    for colour, (least, most) in ((0, (1.9, 2.4)), (2, (1.5, 1.9))):
+        undone = gain[:, 1] / gain[:, colour]
+        assert least <= undone.min() + 1e-4 and undone.max() <= most + 1e-4
+        assert undone.mean() == pytest.approx((least + most) / 2, rel=0.01)
+    ln_a, ln_b = a.log(), b.log()
+    assert 0.0001 <= a.min() * 1.0001 and a.max() <= 0.012 * 1.0001
+    assert ln_a.mean() == pytest.approx(np.log(0.0001 * 0.012) / 2, abs=0.05)
+    left = ln_b - 2.18 * ln_a - 1.20
+    assert left.mean() == pytest.approx(0, abs=0.01) and left.std() == pytest.approx(0.26, rel=0.02)
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_every_recipe_makes_batches(packed, recipe):
+    torch.manual_seed(0)
+    level = torch.full((2,), 10.0) if recipe == "paper" else None
+    older, newer, flow = batch_of(Textures(packed, held_out=False), 64, 64, level, batch=2, recipe=recipe)
+    assert older.shape == newer.shape == (2, 3, 64, 64) and flow.shape == (2, 2, 64, 64)
+    assert 0 <= older.min() and older.max() <= 1 and older.isfinite().all() and older.std() > 0.01
