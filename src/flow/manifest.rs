@@ -40,6 +40,13 @@ pub struct Entry {
     pub golden: Option<Golden>,
 }
 
+impl Entry {
+    /// Whether the node's own operators run it in bf16: it has graphs for them, and was judged in so many bits.
+    pub fn has_tiles(&self) -> bool {
+        self.pyramid_bf16.is_some() && self.decoder_bf16.is_some() && self.precisions.contains(&Precision::Bf16)
+    }
+}
+
 /// The ways that graphs can be called.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]

@@ -9,7 +9,6 @@ use nightflow::{
         Config, Matcher, Operators, Own, Precision,
         convolutions::Unit,
         cost_volume::{CostVolume, Inputs, Outputs, Shape, Unfit},
-        manifest::Entry,
     },
 };
 
@@ -17,7 +16,7 @@ use crate::allocations::{self, Allocations};
 
 /// How far a fused graph's flow and confidence may lie from the plain one's, in pixels.
 const APART: f32 = 1e-4;
-/// The same where nothing matches anything, or everything does: there a network makes much of the last digits.
+/// The same where nothing matches anything: there a network makes much of the last digits.
 const APART_IN_NOISE: f32 = 5e-4;
 /// The same for vectors of more than ten pixels, as a part of them: floats have no more than seven digits.
 const APART_PART: f32 = 1e-5;
@@ -102,17 +101,19 @@ fn between(matcher: &mut Matcher, [older, newer]: &[Exposed; 2]) -> (Vec<f32>, V
 
 #[test]
 fn a_fused_graph_gives_the_plain_ones_flow() {
-    // A picture of one wave matches all along it, a period further on, too.
-    let mut pairs = vec![(APART_IN_NOISE, [golden(192, 128, 1, (0.0, 0.0)), golden(192, 128, 2, (2.0, 1.0))])];
     // Far more than the finest levels reach, so that the coarse ones fetch from far and from outside.
-    pairs.push((APART, [waves(320, 256, 3, (0.0, 0.0)), waves(320, 256, 4, (-23.0, 17.0))]));
+    let mut pairs = vec![(APART, [waves(320, 256, 3, (0.0, 0.0)), waves(320, 256, 4, (-23.0, 17.0))])];
     for (number, (width, height)) in [(64, 64), (128, 64), (150, 90), (320, 256), (64, 448)].into_iter().enumerate() {
         let number = 2 * number as u64 + 5;
         pairs.push((APART_IN_NOISE, [noise(width, height, number), noise(width, height, number + 1)]));
     }
     for network in networks() {
         let [mut plain, mut fused] = [Operators::Plain, Operators::Fused].map(|operators| open(&network, operators, 2));
-        for (allowed, pair) in &pairs {
+        // The golden picture is one wave, which matches again a period further on. The twin that never saw noise makes as much
+        // of that as of noise.
+        let apart = if network == "pwcnet_clean" { APART_IN_NOISE } else { APART };
+        let first = (apart, [golden(192, 128, 1, (0.0, 0.0)), golden(192, 128, 2, (2.0, 1.0))]);
+        for (allowed, pair) in std::iter::once(&first).chain(&pairs) {
             let (wanted, found) = (between(&mut plain, pair), between(&mut fused, pair));
             let apart = |wanted: &[f32], found: &[f32]| {
                 assert_eq!(wanted.len(), found.len());
@@ -171,21 +172,20 @@ fn a_cost_volume_takes_memory_at_the_first_call_of_a_size_only() {
     assert_eq!(allocations::during(|| (0..10).for_each(|_| run())).1, Allocations { calls: 0, peak: 0 });
 }
 
+/// How often a few steps ask for memory, once a network has its own.
+fn taken(mut matcher: Matcher) -> usize {
+    let [older, newer] = &[golden(192, 128, 1, (0.0, 0.0)), golden(192, 128, 2, (2.0, 1.0))];
+    let mut own = Own::default();
+    let mut run = || matcher.between(&Pair { older, newer, gain_step: None }, &mut own).map(drop).unwrap();
+    (0..3).for_each(|_| run());
+    allocations::during(|| (0..5).for_each(|_| run())).1.calls
+}
+
 #[test]
 fn a_fused_step_takes_no_more_memory_than_a_plain_one() {
-    let pair = [golden(192, 128, 1, (0.0, 0.0)), golden(192, 128, 2, (2.0, 1.0))];
     for network in networks() {
-        let taken = [Operators::Plain, Operators::Fused].map(|operators| {
-            let mut matcher = open(&network, operators, 2);
-            let mut own = Own::default();
-            let mut run = || {
-                let [older, newer] = &pair;
-                matcher.between(&Pair { older, newer, gain_step: None }, &mut own).map(drop).unwrap();
-            };
-            (0..3).for_each(|_| run());
-            allocations::during(|| (0..5).for_each(|_| run())).1.calls
-        });
-        assert_eq!(taken[0], taken[1], "{network}");
+        let [plain, fused] = [Operators::Plain, Operators::Fused].map(|operators| taken(open(&network, operators, 2)));
+        assert_eq!(plain, fused, "{network}");
     }
 }
 
@@ -195,8 +195,7 @@ const BF16_APART: [f32; 2] = [0.01, 0.5];
 /// Every network with graphs in bf16, that was judged in it.
 fn networks_in_bf16() -> Vec<String> {
     let entries = nightflow::flow::manifest::entries(&models()).unwrap();
-    let able = |entry: &Entry| entry.decoder_bf16.is_some() && entry.precisions.contains(&Precision::Bf16);
-    let found: Vec<String> = entries.into_iter().filter(|(_, entry)| able(entry)).map(|(name, _)| name).collect();
+    let found: Vec<String> = entries.into_iter().filter(|(_, entry)| entry.has_tiles()).map(|(name, _)| name).collect();
     assert!(!found.is_empty(), "no network of the manifest has graphs in bf16");
     found
 }
@@ -248,16 +247,6 @@ fn bf16_gives_the_flow_of_32_bits_or_says_what_it_needs() {
 
 #[test]
 fn a_step_in_bf16_takes_no_more_memory_than_a_plain_one() {
-    let pair = [golden(192, 128, 1, (0.0, 0.0)), golden(192, 128, 2, (2.0, 1.0))];
-    let taken = |mut matcher: Matcher| {
-        let mut own = Own::default();
-        let mut run = || {
-            let [older, newer] = &pair;
-            matcher.between(&Pair { older, newer, gain_step: None }, &mut own).map(drop).unwrap();
-        };
-        (0..3).for_each(|_| run());
-        allocations::during(|| (0..5).for_each(|_| run())).1.calls
-    };
     for network in networks_in_bf16() {
         let Some(tiles) = open_in_bf16(&network, 2) else { continue };
         assert_eq!(taken(tiles), taken(open(&network, Operators::Plain, 2)), "{network}");

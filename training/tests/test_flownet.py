@@ -11,11 +11,13 @@ import torch.nn.functional as F
 
 import checkpoints
 import export
-from export import FRAMES, Exported, gigamacs, golden_frames, graphs_of, moved, parity, rounded
+from export import FRAMES, Exported, gigamacs, golden_frames, graphs_of, rounded
 from flownet import KINDS, REACH, SHIFT, FlowNetS, even, slim
 from networks import cost_volume, cost_volume_plain
 from pairs import batch_of
 from scenes import Textures
+# It is run here once more, with this file's `fresh` networks.
+from test_export import test_graphs_equal_pytorch  # noqa: F401
 from train import Run, start
 
 DESCRIPTION = {
@@ -115,14 +117,6 @@ def fresh(request):
             parameter.add_(0.003 * torch.randn_like(parameter))
     graphs = {part: graph.SerializeToString() for part, graph in graphs_of(network).items()}
     return rounded(network), graphs, Exported(graphs["pyramid"], graphs["decoder"], threads=1)
-
-
-@pytest.mark.parametrize("height, width", [(64, 64), (128, 192), (256, 320), (448, 640)])
-def test_graphs_equal_pytorch(fresh, height, width):
-    network, _, exported = fresh
-    assert parity(network, exported, *moved(height, width, 1)) < 1e-3
-    random = np.random.default_rng(0)
-    assert parity(network, exported, *(random.random((1, 3, height, width), np.float32) for _ in range(2))) < 1e-3
 
 
 def test_graphs_keep_to_the_interface(fresh):

@@ -128,8 +128,7 @@ fn network(config: &Config) -> Vec<(&'static str, Finding)> {
 /// Whether this processor has tiles for bf16, the network graphs for them, and the settings neither.
 fn may_be_faster(flow: &flow::Config) -> bool {
     let folder = manifest::folder(&flow.models, std::env::current_exe().ok().as_deref());
-    let able = manifest::entry(&folder, &flow.network)
-        .is_ok_and(|entry| entry.decoder_bf16.is_some() && entry.precisions.contains(&Precision::Bf16));
+    let able = manifest::entry(&folder, &flow.network).is_ok_and(|entry| entry.has_tiles());
     let asked = flow.provider == Provider::Cpu && flow.precision == Precision::Fp32;
     able && asked && Unit::best().is_fast()
 }

@@ -10,6 +10,7 @@ use super::{
     tiles::{narrowed, widened},
     *,
 };
+use crate::flow::cost_volume::tests::noise;
 
 impl From<Unfit> for Infallible {
     fn from(unfit: Unfit) -> Self {
@@ -21,18 +22,6 @@ impl From<chain::Unfit> for Infallible {
     fn from(unfit: chain::Unfit) -> Self {
         panic!("{unfit}")
     }
-}
-
-/// Numbers of −1 to 1 from a seed.
-fn noise(seed: u64, count: usize) -> Vec<f32> {
-    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
-    let mut next = || {
-        state ^= state << 13;
-        state ^= state >> 7;
-        state ^= state << 17;
-        (state >> 40) as f32 / (1 << 23) as f32 - 1.0
-    };
-    (0..count).map(|_| next()).collect()
 }
 
 /// Planes of f64.

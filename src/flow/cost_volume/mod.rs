@@ -15,7 +15,7 @@
 mod lanes;
 mod operator;
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;
 mod work;
 
 use crate::flow::bands::{self, Bands};

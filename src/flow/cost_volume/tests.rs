@@ -19,7 +19,7 @@ struct Case {
 type Spread<'a> = dyn Fn(usize, &(dyn Fn(usize) + Sync)) -> Result<(), Unfit> + 'a;
 
 /// Numbers of −1 to 1 from a seed.
-fn noise(seed: u64, count: usize) -> Vec<f32> {
+pub fn noise(seed: u64, count: usize) -> Vec<f32> {
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     let mut next = || {
         state ^= state << 13;

@@ -188,8 +188,7 @@ impl<'a> Bench<'a> {
     fn has_tiles(&self, entry: &Entry) -> bool {
         let Config { provider, precision, .. } = self.config;
         let asked = provider == Provider::Cpu && precision == Precision::Fp32;
-        let judged = entry.decoder_bf16.is_some() && entry.precisions.contains(&Precision::Bf16);
-        asked && judged && convolutions::Unit::best().is_fast()
+        asked && entry.has_tiles() && convolutions::Unit::best().is_fast()
     }
 
     /// Where in a round somebody's turn is: by network, refined before unrefined, fused, plain, then who is no network.
