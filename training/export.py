@@ -417,6 +417,7 @@ def main() -> None:
     parser.add_argument("--version", required=True, help="such as 2026-11-22.1")
     parser.add_argument("--models", type=Path, default=Path("../models"))
     parser.add_argument("--iterations", type=int, nargs="+", help="for RAFT-small: a network for each, as 8 4 12")
+    parser.add_argument("--plain", action="store_true", help="only the two graphs of ONNX's own operators")
     parser.add_argument("--fast", action="store_true", help="for PWC-Net: also NAME_fast, which ends at level 3")
     arguments = parser.parse_args()
     state = checkpoints.load(arguments.checkpoint)
@@ -439,6 +440,8 @@ def export(arguments: argparse.Namespace, network: nn.Module, state: dict, name:
     network.eval().load_state_dict(state["mean"])
     files = {}
     for part, graph in graphs_of(network).items():
+        if arguments.plain and part not in ("pyramid", "decoder"):
+            continue
         # Those with the same weights share what looks at one frame.
         owner = arguments.name if part.startswith("pyramid") else name
         file = f"{owner}_{'decoder_fused' if part == 'fused' else part}"

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from scenes import MIXTURE, Textures, scene, uniform
+from scenes import MIXTURE, Bank, Textures, scene, uniform
 
 MEAN_LEVEL = 0.4
 DARKEST = 30.0
@@ -113,14 +113,17 @@ def unprocess(first, second, matrix, gain, a, b):
 
 
 def batch_of(
-    textures: Textures, height: int, width: int, level: torch.Tensor | None, mixture=MIXTURE, batch: int = 4,
+    textures: Textures | Bank, height: int, width: int, level: torch.Tensor | None, mixture=MIXTURE, batch: int = 4,
     recipe: str = "paper",
 ):
     """A training batch: older, newer [B, 3, H, W] and the flow [B, 2, H, W]. By the recipe `paper` one pair for each
     noise level, or `batch` clean ones; the others draw their own noise for `batch` pairs, and what they make is not
-    brought to a mean."""
+    brought to a mean. A bank has its own mixture."""
     batch = batch if level is None else len(level)
-    first, second, flow = scene(textures, batch, height, width, mixture)
+    if isinstance(textures, Bank):
+        first, second, flow = textures.draw(batch, height, width)
+    else:
+        first, second, flow = scene(textures, batch, height, width, mixture)
     if recipe == "authors-2021":
         return *authors(first, second, *authors_drawn(batch)), flow
     if recipe == "unprocess":

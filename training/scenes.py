@@ -224,6 +224,62 @@ def scene(textures: Textures, batch: int, height: int, width: int, mixture=MIXTU
     return first, second, flow
 
 
+class Bank:
+    """Scenes made once and shown again and again, each time by another window of them in one of four mirror images.
+
+    Making a scene costs more than half of a small network's step. Noise is not in the bank: it is drawn anew each time.
+    """
+
+    def __init__(self, frames: torch.Tensor, flow: torch.Tensor):
+        """Frames [N, 2, 3, H, W] as bytes and flow [N, 2, H, W] in pixels."""
+        self.frames, self.flow = frames, flow
+
+    @classmethod
+    def made(cls, textures: Textures, count: int, height: int, width: int, mixture=MIXTURE):
+        """`count` scenes, eight at a time."""
+        frames = torch.empty(count, 2, 3, height, width, dtype=torch.uint8)
+        flow = torch.empty(count, 2, height, width, dtype=torch.float16)
+        for i in range(0, count, 8):
+            first, second, flow[i : i + 8] = scene(textures, min(8, count - i), height, width, mixture)
+            frames[i : i + 8] = torch.stack([first, second], 1).mul(255).add(0.5)
+        return cls(frames, flow)
+
+    @classmethod
+    def kept(cls, file: Path, textures: Textures, seed: int, **described):
+        """The bank in a file, which is made if there is none, so that runs and their legs share it. The random numbers of who
+        asks go on as if there were no bank."""
+        described |= {"seed": seed}
+        if not file.exists():
+            with torch.random.fork_rng():
+                torch.manual_seed(seed)
+                made = cls.made(textures, **{key: value for key, value in described.items() if key != "seed"})
+            beside = file.with_name(file.name + ".part")
+            torch.save({"described": described, "frames": made.frames.cpu(), "flow": made.flow.cpu()}, beside)
+            beside.rename(file)
+        held = torch.load(file, weights_only=True, mmap=True, map_location="cpu")
+        if held["described"] != described:
+            raise ValueError(f"{file}: expected a bank of {described}, found one of {held['described']}")
+        return cls(held["frames"], held["flow"])
+
+    def draw(self, batch: int, height: int, width: int):
+        """As `scene`: two frames [B, 3, H, W] in 0...1 and the flow [B, 2, H, W]."""
+        rows, columns = self.flow.shape[2:]
+        which = torch.randint(len(self.flow), (batch,)).tolist()
+        down = torch.randint(rows - height + 1, (batch,)).tolist()
+        right = torch.randint(columns - width + 1, (batch,)).tolist()
+        places = [(n, ..., slice(y, y + height), slice(x, x + width)) for n, y, x in zip(which, down, right)]
+        device = torch.get_default_device()
+        frames = torch.stack([self.frames[place] for place in places]).to(device).float().div_(255)
+        flow = torch.stack([self.flow[place] for place in places]).to(device).float()
+        # Along x, then along y; what is mirrored moves the other way.
+        for component, side in ((0, -1), (1, -2)):
+            mirrored = torch.rand(batch) < 0.5
+            frames[mirrored] = frames[mirrored].flip(side)
+            flow[mirrored] = flow[mirrored].flip(side)
+            flow[mirrored, component] *= -1
+        return frames[:, 0], frames[:, 1], flow
+
+
 if __name__ == "__main__":
     folder, packed = map(Path, sys.argv[1:])
     packed.parent.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,7 @@ from flownet import KINDS
 from networks import PwcNet
 from pairs import DARKEST, RECIPES, HeldOut, batch_of, levels
 from raft import RaftSmall
-from scenes import MIXTURE, Textures
+from scenes import MIXTURE, Bank, Textures
 
 JUDGED_LEVELS = (0, 10, 20, 30, 60)
 
@@ -38,11 +38,12 @@ def network_of(description: dict) -> nn.Module:
 
 
 def start(network: nn.Module, where: str) -> None:
-    """Weights to start from: published ones (`*.pth`), or a network's graphs (`../models/pwcnet_fcdn`), which hold its running
-    mean in fp16."""
+    """Weights to start from: published ones (`*.pth`), the running mean in a run's checkpoint (`runs/flownets/checkpoint`), or
+    a network's graphs (`../models/pwcnet_fcdn`), which hold it in fp16."""
     if where.endswith(".pth"):
         return network.published(where)
-    held = checkpoints.of_graphs(Path(where))
+    folder = Path(where)
+    held = checkpoints.load(folder)["mean"] if checkpoints.exists(folder) else checkpoints.of_graphs(folder)
     missing, unknown = network.load_state_dict(held, strict=False)
     if unknown:
         raise ValueError(f"{where}: expected weights of {type(network).__name__}, {unknown} is unknown")
@@ -242,6 +243,9 @@ def leg(run: Run, folder: Path, packed: Path, minutes: float, every: float) -> N
     if not first:  # Workers start from one checkpoint and must not draw the same scenes.
         torch.manual_seed(1000 * run.step + dist.get_rank())
     mixture = run.description.get("displacements", MIXTURE)
+    if "bank" in run.description:
+        bank = dict(run.description["bank"])
+        textures = Bank.kept(Path(bank.pop("file")), textures, run.description["seed"], mixture=mixture, **bank)
     before, began, row_due, losses, over = run.seconds, time.monotonic(), run.seconds + 60 * every, [], False
     told, counted = began + 30, 0
     if first and run.step == 0:
@@ -298,6 +302,7 @@ def main() -> None:
     parser.add_argument("--photographs", type=Path, default=Path("runs/photographs.npz"))
     parser.add_argument("--minutes", type=float, required=True)
     parser.add_argument("--every", type=float, default=4.0, help="minutes between log rows")
+    parser.add_argument("--recipe", choices=("clean", *RECIPES), help="instead of the description's; the run is then NAME_RECIPE")
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
@@ -309,8 +314,12 @@ def main() -> None:
             arguments.device = f"cuda:{os.environ['LOCAL_RANK']}"
     # Scenes and network are made where this says.
     torch.set_default_device(arguments.device)
-    run = Run(tomllib.loads(arguments.description.read_text()))
-    folder = Path("runs") / arguments.description.stem
+    description, name = tomllib.loads(arguments.description.read_text()), arguments.description.stem
+    if arguments.recipe:
+        description |= {"clean": arguments.recipe == "clean", "recipe": arguments.recipe}
+        name = f"{name}_{arguments.recipe}"
+    run = Run(description)
+    folder = Path("runs") / name
     folder.mkdir(parents=True, exist_ok=True)
     if arguments.resume and checkpoints.exists(folder / "checkpoint"):
         run.load(folder / "checkpoint")

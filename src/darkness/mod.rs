@@ -1,6 +1,7 @@
 //! The laboratory of the paper: noise models, synthetic flights and darkness, and evaluation.
 
 pub mod bound;
+pub mod by_training;
 mod contact;
 pub mod course;
 mod curves;

@@ -12,7 +12,7 @@ from PIL import Image
 import scenes
 from pairs import (MEAN_LEVEL, RECIPES, HeldOut, Stream, authors, authors_drawn, batch_of, linear, noisy, public_pairs,
                    read_flo, unprocess, unprocess_drawn)
-from scenes import Textures, homographies, mapped, scene
+from scenes import Bank, Textures, homographies, mapped, scene
 
 
 def test_flow_carries_the_second_frame_back_onto_the_first(packed):
@@ -29,6 +29,39 @@ def test_flow_carries_the_second_frame_back_onto_the_first(packed):
     # Occlusions spoil some pixels, so medians; without the flow the difference is several times as large.
     assert right.median() < 0.004
     assert right.median() < 0.3 * still.median()
+
+
+def test_a_bank_shows_its_scenes_in_windows_and_mirrors(packed):
+    torch.manual_seed(2)
+    bank = Bank.made(Textures(packed, held_out=False), 9, 96, 128, mixture=[(1.0, 2.0, 5.0)])
+    assert bank.frames.shape == (9, 2, 3, 96, 128) and bank.flow.shape == (9, 2, 96, 128)
+    first, second, flow = batch_of(bank, 64, 96, None, batch=64)
+    assert first.shape == second.shape == (64, 3, 64, 96) and flow.shape == (64, 2, 64, 96)
+    first, second, flow = bank.draw(64, 64, 96)
+    y, x = torch.meshgrid(torch.arange(64), torch.arange(96), indexing="ij")
+    there = torch.stack([x, y])[None] + flow
+    grid = torch.stack([(there[:, 0] + 0.5) * 2 / 96 - 1, (there[:, 1] + 0.5) * 2 / 64 - 1], -1)
+    back = F.grid_sample(second, grid, align_corners=False)
+    inside = (grid.abs() < 0.98).all(-1)
+    # Of every mirror image too: a sign that were wrong would be seen in three quarters of them.
+    of = lambda other: torch.stack([e[seen].mean() for e, seen in zip((other - first).abs().mean(1), inside)])
+    right, still = of(back), of(second)
+    told = still > 0.02
+    assert told.sum() > 32 and (right < 0.5 * still)[told].float().mean() > 0.9
+    shown = {tuple(window.flatten()[:50].tolist()) for window in flow}
+    assert len(shown) == 64
+
+
+def test_a_kept_bank_is_shared_and_another_is_refused(packed, tmp_path):
+    textures, file = Textures(packed, held_out=False), tmp_path / "bank.pt"
+    described = {"count": 3, "height": 64, "width": 64, "mixture": [[1.0, 0.5, 2.0]]}
+    before = torch.get_rng_state()
+    made = Bank.kept(file, textures, 5, **described)
+    again = Bank.kept(file, textures, 5, **described)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert torch.equal(made.frames, again.frames) and torch.equal(made.flow, again.flow)
+    with pytest.raises(ValueError, match="expected a bank of .*'seed': 6.*, found one of .*'seed': 5"):
+        Bank.kept(file, textures, 6, **described)
 
 
 def test_no_motion_means_equal_frames_and_zero_flow(packed):

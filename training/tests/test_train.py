@@ -10,7 +10,7 @@ import torch.distributed as dist
 import checkpoints
 from pairs import HeldOut, batch_of
 from scenes import Textures
-from train import Run, agreed, average_gradients, judged, leg
+from train import Run, agreed, average_gradients, judged, leg, main
 
 DESCRIPTION = {
     "seed": 1, "network": "pwcnet", "clean": False, "peak_rate": 6e-4, "warm_up_steps": 5, "weight_decay": 1e-4, "clip": 1.0,
@@ -100,8 +100,9 @@ def test_every_description_makes_a_run(description):
     if description.name == "pyproject.toml":
         return
     known = tomllib.loads(description.read_text())
-    own = {"pwcnet": {"start"}, "raftsmall": {"iterations", "start"}}.get(known["network"], {"width"})
-    extra = {"darkest", "towards_bright", "displacements", "recipe"}
+    leg = {"start"} if description.stem.endswith("_leg") else set()
+    own = {"pwcnet": {"start"}, "raftsmall": {"iterations", "start"}}.get(known["network"], {"width"} | leg)
+    extra = {"darkest", "towards_bright", "displacements", "recipe", "bank"}
     assert set(known) - extra == set(DESCRIPTION) | own, "the same keys as every run"
     known.pop("start", None)
     run = Run(known)
@@ -125,6 +126,34 @@ def test_a_leg_writes_its_log_and_a_checkpoint(packed, tmp_path):
     again = Run(DESCRIPTION)
     again.load(tmp_path / "checkpoint")
     assert again.step == 2
+
+
+def test_a_leg_from_a_checkpoint_by_another_recipe_out_of_a_bank(packed, tmp_path, monkeypatch, one_thread):
+    monkeypatch.chdir(tmp_path)
+    lines = [f"{key} = {toml(value)}" for key, value in (DESCRIPTION | {"schedule": {"steps": 2}, "clean": True}).items()]
+    whole = "\n".join([*lines, 'bank = { file = "runs/bank.pt", count = 4, height = 64, width = 128 }'])
+    (tmp_path / "bright.toml").write_text(whole)
+    (tmp_path / "leg.toml").write_text(whole + '\nstart = "runs/bright/checkpoint"')
+    given = ["--photographs", str(packed), "--minutes", "10", "--every", "10", "--threads", "1", "--device", "cpu", "--resume"]
+    for arguments in (["bright.toml"], ["leg.toml", "--recipe", "authors-2021"], ["leg.toml", "--recipe", "clean"]):
+        monkeypatch.setattr("sys.argv", ["train.py", *arguments, *given])
+        main()
+    start = checkpoints.load(tmp_path / "runs" / "bright" / "checkpoint")["mean"]
+    begun = Run(tomllib.loads((tmp_path / "leg.toml").read_text()))
+    assert all(torch.equal(value, start[key]) for key, value in begun.network.state_dict().items())
+    ended = [checkpoints.load(tmp_path / "runs" / f"leg_{name}" / "checkpoint") for name in ("authors-2021", "clean")]
+    assert [state["step"] for state in ended] == [2, 2]
+    # Another recipe is another run.
+    assert any(not torch.equal(value, ended[1]["mean"][key]) for key, value in ended[0]["mean"].items())
+
+
+def toml(value) -> str:
+    """What a description may hold, as TOML."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {toml(inner)}" for key, inner in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    return {True: "true", False: "false"}[value] if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else repr(value)
 
 
 def test_ten_pairs_are_learned_by_heart(packed):

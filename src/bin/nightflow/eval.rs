@@ -1,5 +1,6 @@
 //! `nightflow eval`: methods judged on data sets with true flow, as they are or photographed ever darker.
 
+mod recipes;
 mod reference;
 
 use std::path::{Path, PathBuf};
@@ -33,6 +34,7 @@ Examples:
   nightflow eval Sintel/training --models pwcnet_fcdn,raft=raft_small.onnx --linear
   nightflow eval ladder pairs/ --camera 'Canon EOS M6' --iso 3200 --models pwcnet_fcdn,zero --enhancers none,nlm
   nightflow eval pairs/ --models dis=results/dis --enhancers none
+  nightflow eval recipes pairs/ scenes/ --out table       (the paper's table: see its --help)
   nightflow eval reference mine/ --out judged             (pairs without a truth: see its --help)
 
 A data set is known by its layout: VBOF (CCPPQQEE_img1.*), FlyingChairs and FCDN (NAME_img1.*, NAME_img2.*,
@@ -55,6 +57,8 @@ pub struct Args {
 enum Sub {
     /// Photograph bright pairs at seven ever darker exposures with a camera's noise, and judge methods on each.
     Ladder(LadderArgs),
+    /// The paper's table: networks by what they were trained on and what frames went through, by exposure.
+    Recipes(recipes::Args),
     /// Make reference flow for bright pairs of your own, so that darker exposures of the same scenes can be judged.
     Reference(reference::Args),
 }
@@ -134,40 +138,41 @@ fn kind(text: &str) -> Result<Kind, String> {
 /// Evaluates and prints the tables.
 pub fn run(args: Args) -> Result<Exit> {
     match (args.sub, args.dataset) {
+        (Some(Sub::Recipes(args)), _) => recipes::run(args),
         (Some(Sub::Reference(args)), _) => reference::run(&args),
-        (Some(Sub::Ladder(ladder)), _) => {
-            if ladder.patch.is_multiple_of(2) {
-                bail!("--patch is {}; expected an odd number of pixels, as 15", ladder.patch);
-            }
-            let sensor = Sensor::find(&ladder.camera, ladder.iso)?;
-            let mut about = vec![
-                (
-                    "camera".to_owned(),
-                    format!(
-                        "{} at ISO {}, seed {}, draws a pair: {}",
-                        ladder.camera, ladder.iso, ladder.seed, ladder.draws
-                    ),
-                ),
-                ("limit".to_owned(), format!("Cramér–Rao, a square of {0} × {0} pixels", ladder.patch)),
-            ];
-            let mut faults: Vec<Fault> = vec![];
-            for fault in &ladder.faults {
-                if !faults.contains(fault) {
-                    faults.push(*fault);
-                }
-            }
-            if faults != [Fault::None] {
-                about.extend(faults.iter().map(|fault| (format!("noise {fault}"), fault.about().to_owned())));
-            }
-            let light = Light::Ladder { sensor, seed: ladder.seed, patch: ladder.patch, faults };
-            evaluate(&ladder.pairs, &light, &ladder.how, about, ladder.draws)
-        }
+        (Some(Sub::Ladder(ladder)), _) => publish(&descended(&ladder)?, &ladder.how),
         (None, Some(dataset)) => {
             let light = if args.linear { Light::Linear } else { Light::AsItIs };
-            evaluate(&dataset, &light, &args.how, vec![], 1)
+            publish(&evaluate(&dataset, &light, &args.how, vec![], 1)?, &args.how)
         }
         (None, None) => bail!("a data set's folder is needed"),
     }
+}
+
+/// What a ladder finds.
+fn descended(ladder: &LadderArgs) -> Result<Report> {
+    if ladder.patch.is_multiple_of(2) {
+        bail!("--patch is {}; expected an odd number of pixels, as 15", ladder.patch);
+    }
+    let sensor = Sensor::find(&ladder.camera, ladder.iso)?;
+    let mut about = vec![
+        (
+            "camera".to_owned(),
+            format!("{} at ISO {}, seed {}, draws a pair: {}", ladder.camera, ladder.iso, ladder.seed, ladder.draws),
+        ),
+        ("limit".to_owned(), format!("Cramér–Rao, a square of {0} × {0} pixels", ladder.patch)),
+    ];
+    let mut faults: Vec<Fault> = vec![];
+    for fault in &ladder.faults {
+        if !faults.contains(fault) {
+            faults.push(*fault);
+        }
+    }
+    if faults != [Fault::None] {
+        about.extend(faults.iter().map(|fault| (format!("noise {fault}"), fault.about().to_owned())));
+    }
+    let light = Light::Ladder { sensor, seed: ladder.seed, patch: ladder.patch, faults };
+    evaluate(&ladder.pairs, &light, &ladder.how, about, ladder.draws)
 }
 
 /// In what light the pairs are shown.
@@ -197,7 +202,7 @@ struct View {
     limit: Option<bound::Limit>,
 }
 
-fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, String)>, draws: u32) -> Result<Exit> {
+fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, String)>, draws: u32) -> Result<Report> {
     let Found { kind, mut items, mut skipped } = datasets::find(folder, how.layout)?;
     if kind == Kind::Vbof && matches!(light, Light::Ladder { .. }) {
         bail!("{} has been photographed in the dark already; a ladder wants bright sRGB pairs", folder.display());
@@ -243,7 +248,7 @@ fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, Str
         }
     }
     bar.finish_and_clear();
-    publish(&report, how)
+    Ok(report)
 }
 
 /// The pair in every light, made when its turn comes.
