@@ -77,6 +77,14 @@ const MEASURES: [Measure; 3] = [
 ];
 
 impl Report {
+    /// Takes note of a condition and of how it is shown; `exposure 2` stands before `exposure 10`.
+    pub fn knows(&mut self, condition: (String, String)) {
+        if !self.conditions.iter().any(|(known, _)| *known == condition.0) {
+            self.conditions.push(condition);
+            self.conditions.sort_by_key(|known| natural(&known.0));
+        }
+    }
+
     /// Methods in the order in which they first came.
     fn methods(&self) -> Vec<String> {
         let mut methods: Vec<String> = vec![];
@@ -318,6 +326,12 @@ impl Report {
         chart.configure_series_labels().border_style(BLACK.mix(0.3)).background_style(WHITE.mix(0.8)).draw()?;
         Ok(())
     }
+}
+
+/// Letters, then the number at the end.
+fn natural(name: &str) -> (String, u64) {
+    let letters = name.trim_end_matches(|letter: char| letter.is_ascii_digit());
+    (letters.to_owned(), name[letters.len()..].parse().unwrap_or(0))
 }
 
 /// Stands between a pair's name and the number of the draw of its noise.

@@ -494,9 +494,7 @@ fn the_papers_table_has_a_row_for_every_training_and_enhancer() {
     let nothing = uniform(24, 16, [0.0; 2]);
     for exposure in 0..7 {
         for (name, enhancer) in [("a", "none"), ("a~1", "none"), ("a", "median:5"), ("a~1", "median:5")] {
-            let at = |program: &str| {
-                dir.path().join(format!("{program}/{enhancer}/Exp-{exposure}/{name}_flow.flo"))
-            };
+            let at = |program: &str| dir.path().join(format!("{program}/{enhancer}/Exp-{exposure}/{name}_flow.flo"));
             truth(at("sure"));
             truth(at("unsure"));
             if exposure == 6 && name == "a~1" {
@@ -506,11 +504,13 @@ fn the_papers_table_has_a_row_for_every_training_and_enhancer() {
     }
     let models = format!("flownets_clean={},flownets_fcdn={},zero", path("unsure"), path("sure"));
     let given = ["--models", &models, "--enhancers", "none,median", "--draws", "2", "--out", &path("out")];
-    let nightflow = |sets: &[&str]| {
+    let nightflow = |sets: &[&str], workers: &str| {
         let sets: Vec<String> = sets.iter().map(|set| path(set)).collect();
-        Command::new(env!("CARGO_BIN_EXE_nightflow")).args(["eval", "recipes"]).args(sets).args(given).output().unwrap()
+        let workers = ["--workers", workers];
+        let mut command = Command::new(env!("CARGO_BIN_EXE_nightflow"));
+        command.args(["eval", "recipes"]).args(sets).args(given).args(workers).output().unwrap()
     };
-    let made = nightflow(&["bright", "street"]);
+    let made = nightflow(&["bright", "street"], "1");
     assert_eq!(made.status.code(), Some(0), "{}", String::from_utf8_lossy(&made.stderr));
     let text = String::from_utf8(made.stdout).unwrap();
     let exact = " 0.00 ± 0.00 |".repeat(6);
@@ -531,7 +531,9 @@ fn the_papers_table_has_a_row_for_every_training_and_enhancer() {
         // Seven exposures, two draws, two enhancers for each program and one for zero flow.
         assert_eq!(whole["records"].as_array().unwrap().len(), 7 * 2 * (2 * 2 + 1));
     }
-    let twice = nightflow(&["bright", "bright"]);
+    // As many as there are pairs and more find the same in the same order.
+    assert_eq!(String::from_utf8(nightflow(&["bright", "street"], "3").stdout).unwrap(), text);
+    let twice = nightflow(&["bright", "bright"], "1");
     let said = String::from_utf8(twice.stderr).unwrap();
     assert!(!twice.status.success() && said.contains("two sets are called bright"), "{said}");
 }

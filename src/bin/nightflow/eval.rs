@@ -3,7 +3,10 @@
 mod recipes;
 mod reference;
 
-use std::path::{Path, PathBuf};
+use std::{
+    path::{Path, PathBuf},
+    sync::atomic::{AtomicUsize, Ordering},
+};
 
 use anyhow::{Context, Result, bail};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -124,6 +127,9 @@ struct How {
     /// Threads of the networks.
     #[arg(long, default_value_t = 2)]
     threads: usize,
+    /// Pairs judged at a time, each on --threads of its own: two of one thread are faster than one of two.
+    #[arg(long, default_value_t = 1, value_parser = workers)]
+    workers: usize,
     /// A launch file whose [flow] says with what networks are computed: runtime, provider, precision, operators, models.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -135,12 +141,16 @@ fn kind(text: &str) -> Result<Kind, String> {
     found.ok_or_else(|| format!("{text:?} is no layout; expected {}", names.join(", ")))
 }
 
+fn workers(text: &str) -> Result<usize, String> {
+    text.parse().ok().filter(|count| (1..=64).contains(count)).ok_or_else(|| "expected 1 … 64".into())
+}
+
 /// Evaluates and prints the tables.
 pub fn run(args: Args) -> Result<Exit> {
     match (args.sub, args.dataset) {
         (Some(Sub::Recipes(args)), _) => recipes::run(args),
         (Some(Sub::Reference(args)), _) => reference::run(&args),
-        (Some(Sub::Ladder(ladder)), _) => publish(&descended(&ladder)?, &ladder.how),
+        (Some(Sub::Ladder(ladder)), _) => publish(&descended(&ladder, Some(ladder.patch))?, &ladder.how),
         (None, Some(dataset)) => {
             let light = if args.linear { Light::Linear } else { Light::AsItIs };
             publish(&evaluate(&dataset, &light, &args.how, vec![], 1)?, &args.how)
@@ -149,19 +159,17 @@ pub fn run(args: Args) -> Result<Exit> {
     }
 }
 
-/// What a ladder finds.
-fn descended(ladder: &LadderArgs) -> Result<Report> {
-    if ladder.patch.is_multiple_of(2) {
-        bail!("--patch is {}; expected an odd number of pixels, as 15", ladder.patch);
+/// What a ladder finds, with the limit for a square of so many pixels if that is asked for.
+fn descended(ladder: &LadderArgs, patch: Option<usize>) -> Result<Report> {
+    if let Some(patch) = patch.filter(|patch| patch.is_multiple_of(2)) {
+        bail!("--patch is {patch}; expected an odd number of pixels, as 15");
     }
     let sensor = Sensor::find(&ladder.camera, ladder.iso)?;
-    let mut about = vec![
-        (
-            "camera".to_owned(),
-            format!("{} at ISO {}, seed {}, draws a pair: {}", ladder.camera, ladder.iso, ladder.seed, ladder.draws),
-        ),
-        ("limit".to_owned(), format!("Cramér–Rao, a square of {0} × {0} pixels", ladder.patch)),
-    ];
+    let mut about = vec![(
+        "camera".to_owned(),
+        format!("{} at ISO {}, seed {}, draws a pair: {}", ladder.camera, ladder.iso, ladder.seed, ladder.draws),
+    )];
+    about.extend(patch.map(|side| ("limit".into(), format!("Cramér–Rao, a square of {side} × {side} pixels"))));
     let mut faults: Vec<Fault> = vec![];
     for fault in &ladder.faults {
         if !faults.contains(fault) {
@@ -171,7 +179,7 @@ fn descended(ladder: &LadderArgs) -> Result<Report> {
     if faults != [Fault::None] {
         about.extend(faults.iter().map(|fault| (format!("noise {fault}"), fault.about().to_owned())));
     }
-    let light = Light::Ladder { sensor, seed: ladder.seed, patch: ladder.patch, faults };
+    let light = Light::Ladder { sensor, seed: ladder.seed, patch, faults };
     evaluate(&ladder.pairs, &light, &ladder.how, about, ladder.draws)
 }
 
@@ -179,7 +187,7 @@ fn descended(ladder: &LadderArgs) -> Result<Report> {
 enum Light {
     AsItIs,
     Linear,
-    Ladder { sensor: Sensor, seed: u64, patch: usize, faults: Vec<Fault> },
+    Ladder { sensor: Sensor, seed: u64, patch: Option<usize>, faults: Vec<Fault> },
 }
 
 impl Light {
@@ -215,40 +223,80 @@ fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, Str
         bail!("{} has no pair{}", folder.display(), how.only.as_ref().map_or(String::new(), |t| format!(" named {t}")));
     }
     let config = flow::Config { threads: how.threads, ..launch::read(how.config.as_deref())?.flow };
-    let mut methods = how.models.iter().map(|given| Method::open(given, &config)).collect::<Result<Vec<_>, _>>()?;
-    let enhancers = how.enhancers.iter().cloned().map(|by| Enhancing::open(by, &config));
-    let mut enhancers = enhancers.collect::<Result<Vec<_>, _>>()?;
+    let first = Bench::open(how, &config)?;
     let layout = KINDS.iter().find(|(_, known)| *known == kind).map_or("", |(name, _)| name);
     about.insert(0, ("data".into(), format!("{} ({layout}), {} pairs", folder.display(), items.len())));
-    about.extend(methods.iter().map(|method| (method.name.clone(), method.about())));
+    about.extend(first.methods.iter().map(|method| (method.name.clone(), method.about())));
     let (rungs, faults) = light.views();
     // With the camera's own noise alone nothing is compared.
-    let compared = if faults == [Fault::None] { vec![] } else { faults.to_vec() };
-    let mut report = Report { about, skipped, faults: compared, ..Report::default() };
+    let faults = if faults == [Fault::None] { vec![] } else { faults.to_vec() };
     // The name seeds the noise, so that another draw is the same pair by another name.
     let again = |item: &Item, draw: u32| match draw {
         0 => item.clone(),
         _ => Item { name: format!("{}{DRAW}{draw}", item.name), ..item.clone() },
     };
     let items: Vec<Item> = items.iter().flat_map(|item| (0..draws).map(move |draw| again(item, draw))).collect();
-    let steps = rungs * faults.len() * enhancers.len();
+    let steps = rungs * light.views().1.len() * how.enhancers.len();
     let bar = progress(items.len() * steps)?;
-    for item in &items {
-        bar.set_message(item.name.clone());
-        match datasets::load(item) {
-            Ok(loaded) => {
-                for view in views(item, loaded, light) {
-                    judge(item, view?, &mut methods, &mut enhancers, how, &mut report, &bar)?;
+    let empty = Report { faults: faults.clone(), ..Report::default() };
+    let next = AtomicUsize::new(0);
+    // Each worker takes the next pair, and what is found is put together in the order of the pairs.
+    let work = |mut bench: Bench| -> Result<Vec<(usize, Report)>> {
+        let mut found = vec![];
+        loop {
+            let at = next.fetch_add(1, Ordering::Relaxed);
+            let Some(item) = items.get(at) else { return Ok(found) };
+            bar.set_message(item.name.clone());
+            let mut report = empty.clone();
+            match datasets::load(item) {
+                Ok(loaded) => {
+                    for view in views(item, loaded, light) {
+                        judge(item, view?, &mut bench, how, &mut report, &bar)?;
+                    }
+                }
+                Err(left) => {
+                    bar.inc(steps as u64);
+                    report.skipped.push(left);
                 }
             }
-            Err(left) => {
-                bar.inc(steps as u64);
-                report.skipped.push(left);
-            }
+            found.push((at, report));
         }
-    }
+    };
+    let more = (1..how.workers).map(|_| Bench::open(how, &config)).collect::<Result<Vec<_>>>()?;
+    let mut found = std::thread::scope(|scope| -> Result<Vec<(usize, Report)>> {
+        let others: Vec<_> = more.into_iter().map(|bench| scope.spawn(|| work(bench))).collect();
+        let mut found = work(first)?;
+        for other in others {
+            found.extend(other.join().map_err(|_| anyhow::anyhow!("a worker of the evaluation panicked"))??);
+        }
+        Ok(found)
+    })?;
     bar.finish_and_clear();
-    Ok(report)
+    found.sort_by_key(|(at, _)| *at);
+    let mut whole = Report { about, skipped, faults, ..Report::default() };
+    for (_, part) in found {
+        for known in part.conditions {
+            whole.knows(known);
+        }
+        whole.records.extend(part.records);
+        whole.limits.extend(part.limits);
+        whole.skipped.extend(part.skipped);
+    }
+    Ok(whole)
+}
+
+/// What a worker judges and what it puts before it.
+struct Bench {
+    methods: Vec<Method>,
+    enhancers: Vec<Enhancing>,
+}
+
+impl Bench {
+    fn open(how: &How, config: &flow::Config) -> Result<Self> {
+        let methods = how.models.iter().map(|given| Method::open(given, config)).collect::<Result<Vec<_>, _>>()?;
+        let enhancers = how.enhancers.iter().cloned().map(|by| Enhancing::open(by, config));
+        Ok(Self { methods, enhancers: enhancers.collect::<Result<Vec<_>, _>>()? })
+    }
 }
 
 /// The pair in every light, made when its turn comes.
@@ -264,7 +312,7 @@ fn views(item: &Item, loaded: datasets::Loaded, light: &Light) -> impl Iterator<
                 let rung = linear.expose(&Sensor { fault, ..*sensor }, MEANS[at], *seed, &item.name);
                 // It is of white noise, the same for every kind.
                 let truth = truths.first().filter(|_| faults.first() == Some(&fault));
-                let limit = truth.and_then(|(_, truth)| bound::limit(&rung, truth, *patch));
+                let limit = truth.zip(*patch).and_then(|((_, truth), side)| bound::limit(&rung, truth, side));
                 let noise = 255.0 * rung.noise.variance(1, 0.4).sqrt();
                 let shown = format!("Exp-{at} (mean {}, noise {noise:.1}/255)", MEANS[at]);
                 let [older, newer] = rung.pictures();
@@ -278,15 +326,7 @@ fn views(item: &Item, loaded: datasets::Loaded, light: &Light) -> impl Iterator<
 }
 
 /// Every enhancer and method on one view of a pair.
-fn judge(
-    item: &Item,
-    view: View,
-    methods: &mut [Method],
-    enhancers: &mut [Enhancing],
-    how: &How,
-    report: &mut Report,
-    bar: &ProgressBar,
-) -> Result<()> {
+fn judge(item: &Item, view: View, bench: &mut Bench, how: &How, report: &mut Report, bar: &ProgressBar) -> Result<()> {
     let ladder = view.condition != item.condition;
     // Where the truth comes in several kinds, they are what the table is sorted by.
     let sorted = |truth: &str| match (ladder, view.truths.len()) {
@@ -296,10 +336,7 @@ fn judge(
     };
     for (truth, _) in &view.truths {
         let (condition, shown) = sorted(truth);
-        if !report.conditions.iter().any(|(known, _)| *known == condition) {
-            report.conditions.push((condition.clone(), shown));
-            report.conditions.sort_by_key(|known| natural(&known.0));
-        }
+        report.knows((condition.clone(), shown));
         report.limits.extend(view.limit.map(|limit| (item.name.clone(), condition, limit)));
     }
     let light = match view.fault {
@@ -307,14 +344,14 @@ fn judge(
         fault => format!("{} {fault}", view.condition),
     };
     let folder = light.replace([' ', '/'], "_");
-    for enhancing in enhancers {
+    for enhancing in &mut bench.enhancers {
         let by = enhancing.by.to_string();
         let frames = [enhancing.enhance(&view.frames[0])?, enhancing.enhance(&view.frames[1])?];
         let place = Path::new(&by).join(&folder).join(format!("{}_flow.flo", item.name));
         if let Some(root) = &how.write {
             write(&root.join(&by).join(&folder), &item.name, &frames)?;
         }
-        for method in methods.iter_mut().filter(|method| method.covers(&enhancing.by)) {
+        for method in bench.methods.iter_mut().filter(|method| method.covers(&enhancing.by)) {
             let shown = Shown { frames: [&frames[0], &frames[1]], place: &place };
             let what = format!("{} by {} ({by}, {light})", item.name, method.name);
             let found = match method.flow(&shown) {
@@ -348,12 +385,6 @@ fn mismatch(found: &Field, truth: &Field) -> String {
         return "no pixel's truth is known".into();
     }
     format!("the flow is {}×{}, its truth {}×{}", found.width, found.height, truth.width, truth.height)
-}
-
-/// Sorts `exposure 2` before `exposure 10`.
-fn natural(name: &str) -> (String, u64) {
-    let letters = name.trim_end_matches(|letter: char| letter.is_ascii_digit());
-    (letters.to_owned(), name[letters.len()..].parse().unwrap_or(0))
 }
 
 fn write(folder: &Path, name: &str, frames: &[Picture; 2]) -> Result<()> {

@@ -8,7 +8,7 @@ use std::{
 use anyhow::{Context, Result, bail};
 use nightflow::darkness::{by_training, enhance::Enhancer, faults::Fault, report::Report};
 
-use super::{How, LadderArgs, bound, descended};
+use super::{How, LadderArgs, bound, descended, workers};
 use crate::Exit;
 
 /// The table that the paper made: every network by what it was trained on (clean, FCDN by the paper's recipe, by the
@@ -17,7 +17,7 @@ use crate::Exit;
 #[command(after_help = "\
 Examples:
   nightflow synth scenes --photos photos/ --preset mixed --size 256x192 --count 200 --to scenes
-  nightflow eval recipes pairs/ scenes/ --out table
+  nightflow eval recipes pairs/ scenes/ --threads 1 --workers 2 --out table
   nightflow eval recipes pairs/ --models flownets_clean,flownets_fcdn --draws 1
 
 Of each set --out gets recipes_SET.md (mean end-point error over pairs ± deviation over the draws of the noise), \
@@ -55,6 +55,9 @@ pub struct Args {
     /// Threads of the networks.
     #[arg(long, default_value_t = 2)]
     threads: usize,
+    /// Pairs judged at a time, each on --threads of its own: two of one thread are faster than one of two.
+    #[arg(long, default_value_t = 1, value_parser = workers)]
+    workers: usize,
     /// A launch file whose [flow] says with what networks are computed: runtime, provider, precision, operators, models.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -86,9 +89,10 @@ pub fn run(args: Args) -> Result<Exit> {
             out: None,
             write: None,
             threads: args.threads,
+            workers: args.workers,
             config: args.config.clone(),
         };
-        let report = descended(&LadderArgs {
+        let ladder = LadderArgs {
             pairs: set.clone(),
             camera: args.camera.clone(),
             iso: args.iso,
@@ -97,7 +101,8 @@ pub fn run(args: Args) -> Result<Exit> {
             faults: vec![Fault::None],
             patch: bound::PATCH,
             how,
-        })?;
+        };
+        let report = descended(&ladder, None)?;
         if !report.skipped.is_empty() {
             ended = Exit::DataLost;
         }
