@@ -80,6 +80,8 @@ pub struct Config {
     pub runtime: PathBuf,
     /// Threads of the network.
     pub threads: usize,
+    /// Cores that these threads are kept on, one each; empty: wherever there is room.
+    pub cores: Vec<usize>,
     /// What computes the cost volumes; plain where the network has no fused graph, and for providers other than `cpu`.
     pub operators: Operators,
     /// What computes the graphs.
@@ -119,6 +121,7 @@ impl Default for Config {
             models: PathBuf::new(),
             runtime: PathBuf::new(),
             threads: 2,
+            cores: vec![],
             operators: Operators::Fused,
             provider: Provider::Cpu,
             precision: Precision::Fp32,
@@ -150,6 +153,10 @@ pub const REASONS: &[(&str, &str)] = &[
     ),
     ("runtime", "empty: ORT_DYLIB_PATH, else beside the executable, else where the build put it"),
     ("threads", "2: small boards have four cores, and the camera, the recorder and the autopilot's link need theirs"),
+    (
+        "cores",
+        "empty: the system knows best where there is room; naming them pays where something else would push the network about,          such as cores that are kept free for it (isolcpus)",
+    ),
     (
         "operators",
         "fused: the same flow to a ten-thousandth of a pixel in less time; plain is for comparison and for other runtimes",

@@ -21,6 +21,14 @@ pub enum Error {
         /// Every place that was looked at.
         tried: Vec<Tried>,
     },
+    /// The network's threads cannot be kept on these cores.
+    #[error("[flow] cores = {cores:?}: {why}")]
+    Cores {
+        /// As set.
+        cores: Vec<usize>,
+        /// What is wrong, and what is expected.
+        why: String,
+    },
     /// The manifest or a file of it cannot be read.
     #[error("{}: {reason}", path.display())]
     Manifest {

@@ -5,6 +5,7 @@ use crate::{
     exposure::{Exposed, Pair},
     flow::{
         Config, Error, Flow, Grid, Lender, Resolution,
+        cores::{self, Pinned},
         golden::{self, Deviation},
         network::{Model, Network, Raster, Slot},
         onnx::Onnx,
@@ -60,6 +61,7 @@ impl Matcher {
     /// With the network that the settings name, through ONNX Runtime; checked against its golden output unless the
     /// settings say otherwise.
     pub fn open(config: &Config) -> Result<Self, Error> {
+        cores::check(config)?;
         let mut matcher = Self::with(config, Box::new(Onnx::open(config)?));
         if config.golden_check {
             matcher.check_golden()?;
@@ -118,6 +120,7 @@ impl Matcher {
     pub fn between<'a>(&mut self, pair: &Pair<'_>, lender: &'a mut dyn Lender) -> Result<Flow<'a>, Error> {
         let (older, newer) = (pair.older, pair.newer);
         checked(older, newer)?;
+        let _pinned = Pinned::to(&self.config.cores);
         let slot = self.describe_both(older, newer)?;
         let grid = self.grid(older);
         let canvas = lender.lend(&grid);

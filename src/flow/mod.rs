@@ -3,6 +3,7 @@
 mod bands;
 mod config;
 pub mod convolutions;
+pub mod cores;
 pub mod cost_volume;
 mod error;
 mod fake;

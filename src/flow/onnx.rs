@@ -18,7 +18,7 @@ use ort::{
 use tracing::info;
 
 use crate::flow::{
-    Config, Error, Operators, Precision, Provider, convolutions,
+    Config, Error, Operators, Precision, Provider, convolutions, cores,
     manifest::{self, Kind},
     network::{Golden, Model, Network, Raster, Slot},
     operators,
@@ -160,6 +160,10 @@ impl Graph {
             .map_err(failed(doing))?
             .with_execution_providers(provider::wanted(config, library)?)
             .map_err(failed("start the execution provider"))?;
+        if let Some(workers) = cores::of_workers(&config.cores) {
+            let key = "session.intra_op_thread_affinities";
+            session = session.with_config_entry(key, workers).map_err(failed(doing))?;
+        }
         for (name, length) in size.into_iter().flat_map(dimensions) {
             session = session.with_dimension_override(name, length).map_err(failed(doing))?;
         }

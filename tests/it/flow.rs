@@ -7,7 +7,9 @@ use std::{fs, path::Path, process::Command};
 use nightflow::{
     clock::Stamp,
     exposure::{Exposed, Pair},
-    flow::{Cause, Config, Error, Fake, Flow, Grid, Lender, Matcher, Operators, Own, Resolution, State, runtime},
+    flow::{
+        Cause, Config, Error, Fake, Flow, Grid, Lender, Matcher, Operators, Own, Resolution, State, cores, runtime,
+    },
 };
 
 /// A textured scene seen through a window that stands at `at`.
@@ -342,6 +344,35 @@ fn a_network_writes_into_the_lent_memory_and_copies_once_where_it_must_cut() {
         // ONNX Runtime's own pointer to its output was compared with this memory; a difference would be counted.
         assert_eq!(matcher.counts().copied - before.copied, copied, "{width}x{height}");
     }
+}
+
+#[test]
+fn threads_stay_on_the_cores_that_are_named() {
+    let allowed = cores::allowed();
+    let own: Vec<usize> = allowed.iter().rev().take(2).copied().collect();
+    let config = Config { threads: own.len(), cores: own.clone(), ..Config::default() };
+    let threads = || fs::read_dir("/proc/self/task").unwrap().map(|entry| entry.unwrap().path()).collect::<Vec<_>>();
+    let before = threads();
+    let mut pinned = Matcher::open(&config).unwrap();
+    // Of other tests' threads at the same time none is on a single core.
+    let kept: Vec<String> = threads()
+        .into_iter()
+        .filter(|thread| !before.contains(thread))
+        .filter_map(|thread| fs::read_to_string(thread.join("status")).ok())
+        .filter_map(|text| Some(text.split("Cpus_allowed_list:").nth(1)?.split_whitespace().next()?.to_owned()))
+        .collect();
+    // A session each for pyramid and decoder, and the caller is one thread of both.
+    let found = kept.iter().filter(|list| own.get(1).is_some_and(|core| **list == core.to_string())).count();
+    assert_eq!(found, if own.len() == 2 && allowed.len() > 1 { 2 } else { 0 }, "{kept:?} of {own:?}");
+    let (older, newer) = (frame(128, 64, (0.0, 0.0), 1), frame(128, 64, (1.0, 1.0), 2));
+    let mut free = Matcher::open(&Config { cores: vec![], ..config }).unwrap();
+    let (mut here, mut there) = (Own::default(), Own::default());
+    let flow = pinned.between(&pair(&older, &newer), &mut here).unwrap().vectors.to_vec();
+    assert_eq!(flow, free.between(&pair(&older, &newer), &mut there).unwrap().vectors);
+    assert_eq!(cores::allowed(), allowed, "the caller is where it was");
+    let wrong = Config { cores: vec![1023; 2], threads: 2, ..Config::default() };
+    let said = Matcher::open(&wrong).map(drop).unwrap_err().to_string();
+    assert!(said.starts_with("[flow] cores = [1023, 1023]: 1023 is none that this program may run on"), "{said}");
 }
 
 #[test]
