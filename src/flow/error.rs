@@ -21,6 +21,14 @@ pub enum Error {
         /// Every place that was looked at.
         tried: Vec<Tried>,
     },
+    /// What the network's nodes take was not recorded, or cannot be read.
+    #[error("{}: {reason}", path.display())]
+    Profile {
+        /// The record.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
     /// The network's threads cannot be kept on these cores.
     #[error("[flow] cores = {cores:?}: {why}")]
     Cores {

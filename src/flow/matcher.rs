@@ -1,5 +1,7 @@
 //! One step: the features of two frames, the vectors between them, and a confidence for each.
 
+use std::path::PathBuf;
+
 use crate::{
     clock::Stamp,
     exposure::{Exposed, Pair},
@@ -90,6 +92,11 @@ impl Matcher {
     /// What was done so far.
     pub fn counts(&self) -> Counts {
         Counts { copied: self.counts.copied + self.network.copied(), ..self.counts }
+    }
+
+    /// Ends the record of what each node takes: see [`profile`](super::profile).
+    pub(super) fn end_profile(&mut self) -> Result<Vec<PathBuf>, Error> {
+        self.network.end_profile()
     }
 
     /// Computes the flow that the network's exporter noted and says how far it is off; an error if too far. `None`

@@ -15,6 +15,7 @@ mod onnx;
 mod onnx_graph;
 mod operators;
 pub mod padding;
+pub mod profile;
 mod provider;
 mod refine;
 pub mod runtime;

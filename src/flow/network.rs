@@ -67,6 +67,11 @@ pub trait Network: Send {
         None
     }
 
+    /// Ends the record of what each node takes, and says in which files it is; none where nothing was recorded.
+    fn end_profile(&mut self) -> Result<Vec<PathBuf>, Error> {
+        Ok(vec![])
+    }
+
     /// How many results were not written where they belong and had to be copied there.
     fn copied(&self) -> u64 {
         0

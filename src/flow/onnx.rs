@@ -2,7 +2,7 @@
 
 use std::{
     env,
-    path::PathBuf,
+    path::{Path, PathBuf},
     sync::{Mutex, PoisonError},
 };
 
@@ -131,12 +131,14 @@ fn dimensions([width, height]: [usize; 2]) -> impl Iterator<Item = (String, i64)
 impl Graph {
     /// Sequential, with a fixed number of threads: the order of every sum is fixed, so a replay gives the same bytes.
     ///
-    /// `size` fixes the columns and rows of the images, by the names that the graphs give their dimensions.
+    /// `size` fixes the columns and rows of the images, by the names that the graphs give their dimensions; `profile` is where
+    /// a name for the record of what each node takes begins.
     fn open(
         (environment, library): &Loaded,
         bytes: &[u8],
         config: &Config,
         size: Option<[usize; 2]>,
+        profile: Option<&Path>,
     ) -> Result<Self, Error> {
         let doing = "set up a session";
         let mut session = Session::builder(environment)
@@ -163,6 +165,9 @@ impl Graph {
         if let Some(workers) = cores::of_workers(&config.cores) {
             let key = "session.intra_op_thread_affinities";
             session = session.with_config_entry(key, workers).map_err(failed(doing))?;
+        }
+        if let Some(begin) = profile {
+            session = session.with_profiling(begin).map_err(failed(doing))?;
         }
         for (name, length) in size.into_iter().flat_map(dimensions) {
             session = session.with_dimension_override(name, length).map_err(failed(doing))?;
@@ -269,6 +274,15 @@ fn chosen(config: &Config, entry: &mut manifest::Entry) -> Result<Operators, Err
 impl Onnx {
     /// Finds the library and the network that the settings name, and checks both.
     pub fn open(config: &Config) -> Result<Self, Error> {
+        Self::open_with(config, None)
+    }
+
+    /// The same, but what every node takes is recorded into two files of this folder.
+    pub fn profiled(config: &Config, folder: &Path) -> Result<Self, Error> {
+        Self::open_with(config, Some(folder))
+    }
+
+    fn open_with(config: &Config, profiles: Option<&Path>) -> Result<Self, Error> {
         let loaded = environment(config)?;
         let executable = env::current_exe().ok();
         let folder = manifest::folder(&config.models, executable.as_deref());
@@ -284,8 +298,10 @@ impl Onnx {
         }
         let operators = chosen(config, &mut entry)?;
         let bytes = [manifest::read(&folder, &entry.pyramid)?, manifest::read(&folder, &entry.decoder)?];
-        let open = |bytes: &[u8]| Graph::open(&loaded, bytes, config, None);
-        let (pyramid, decoder) = (open(&bytes[0])?, open(&bytes[1])?);
+        let open = |bytes: &[u8], part: &str| {
+            Graph::open(&loaded, bytes, config, None, profiles.map(|folder| folder.join(part)).as_deref())
+        };
+        let (pyramid, decoder) = (open(&bytes[0], "pyramid")?, open(&bytes[1], "decoder")?);
         let features = features(&entry, &pyramid, &decoder)?;
         let mut assigned = provider::assigned(&pyramid.session).map_err(failed("name its providers"))?;
         for (name, count) in provider::assigned(&decoder.session).map_err(failed("name its providers"))? {
@@ -321,8 +337,8 @@ impl Onnx {
             self.memory = None;
             if let Some(Fixed { loaded, config, bytes: [pyramid, decoder] }) = &self.fixed {
                 let size = Some([width, height]);
-                self.pyramid = Graph::open(loaded, pyramid, config, size)?;
-                self.decoder = Graph::open(loaded, decoder, config, size)?;
+                self.pyramid = Graph::open(loaded, pyramid, config, size, None)?;
+                self.decoder = Graph::open(loaded, decoder, config, size, None)?;
             }
             self.memory = Some(Memory::new(width, height, &self.features).map_err(failed("reserve memory"))?);
         }
@@ -344,6 +360,12 @@ impl Memory {
 }
 
 impl Network for Onnx {
+    fn end_profile(&mut self) -> Result<Vec<PathBuf>, Error> {
+        let sessions = [&mut self.pyramid.session, &mut self.decoder.session];
+        let end = |session: &mut Session| session.end_profiling().map_err(failed("end its record"));
+        sessions.map(end).into_iter().map(|file| file.map(PathBuf::from)).collect()
+    }
+
     fn describe(&mut self, slot: Slot, image: &Padded<'_>) -> Result<(), Error> {
         self.memory(image.width, image.height)?;
         let Some(memory) = &mut self.memory else { return Ok(()) };

@@ -240,6 +240,7 @@ impl<'a> Bench<'a> {
         report.steps = mended(turns::take(&mut turns, self.args.rounds.into(), &bar), &mut rivals.left_out)?;
         bar.finish_and_clear();
         report.whole = machine::resident(std::process::id());
+        self.alone(&frames, report)?;
         report.rivals = self.args.rivals.then(|| {
             let process = rivals.process.as_ref().map(|process| process.borrow().id());
             report::Beside {
@@ -248,6 +249,22 @@ impl<'a> Bench<'a> {
                 resident: process.and_then(machine::resident),
             }
         });
+        Ok(())
+    }
+
+    /// The convolutions of every network by themselves, as the node runs it and in bf16.
+    fn alone(&self, frames: &Rc<[Exposed]>, report: &mut Report) -> Result<()> {
+        for (network, entry) in &self.networks {
+            let config = self.config(network, self.operators(network), self.threads);
+            let mut ways = vec![(What::Step(network.clone(), config.operators), config.clone())];
+            if self.has_tiles(entry) {
+                ways.push((What::Tiles(network.clone()), Config { precision: Precision::Bf16, ..config }));
+            }
+            for (what, config) in ways {
+                let ms = ours::convolutions(&config, frames, self.args.rounds.into());
+                report.alone.push((what.clone(), ms.with_context(|| what.to_string())?));
+            }
+        }
         Ok(())
     }
 

@@ -6,7 +6,7 @@ use anyhow::{Result, ensure};
 use nightflow::{
     clock,
     exposure::{Exposed, Pair},
-    flow::{self, Config, Graph, Matcher, Own, padding},
+    flow::{self, Config, Graph, Matcher, Own, padding, profile},
 };
 
 /// Frames that take turns: three would do for each to be new to the matcher, which keeps two.
@@ -54,6 +54,15 @@ impl Ours {
         self.steps += 1;
         Ok(ms)
     }
+}
+
+/// Operators that convolve: ONNX's and what its runtime makes of them, and the node's own.
+const CONVOLVING: [&str; 6] = ["Conv", "FusedConv", "ConvTranspose", "QLinearConv", "Convolutions", "Encoder"];
+
+/// Milliseconds that the convolutions of a step take by themselves.
+pub fn convolutions(config: &Config, frames: &[Exposed], rounds: usize) -> Result<f64> {
+    let taken = profile::profile(config, frames, rounds)?;
+    Ok(CONVOLVING.iter().filter_map(|operator| taken.get(*operator)).sum())
 }
 
 /// Rows and columns of the matrices.
