@@ -11,7 +11,7 @@ use crate::{
     clock::Stamp,
     exposure::{Exposed, Pair},
     flow::{
-        Config, Error as FlowError, Graph, Matcher, Own, Resolution,
+        Config, Error as FlowError, Graph, Matcher, Own, Resolution, manifest,
         padding::{self, Padded, STRIDE},
     },
 };
@@ -36,7 +36,7 @@ pub enum Error {
     File(#[from] flow_files::Error),
     /// A name that says nothing.
     #[error(
-        "{given:?} is no model; expected zero, a network of the manifest (as pwcnet_fcdn), NAME=FOLDER/NETWORK where \
+        "{given:?} is no model; expected zero, a network of the manifest (as pwcnet_fcdn) or of recipes/ beside it, NAME=FOLDER/NETWORK where \
          FOLDER has a manifest.toml, NAME=FILE.onnx (or NAME=FILE.onnx@1 for inputs of 0…1 instead of 0…255), or \
          NAME=FOLDER of `.flo` files as `ENHANCER/CONDITION/PAIR_flow.flo`"
     )]
@@ -91,7 +91,7 @@ impl Method {
     /// Opens what is named; see [`Error::Unknown`] for the forms. `config` says where models and the runtime are.
     pub fn open(given: &str, config: &Config) -> Result<Self, Error> {
         let network = |name: &str, folder: Option<&Path>| {
-            let models = folder.map_or_else(|| config.models.clone(), Path::to_path_buf);
+            let models = folder.map_or_else(|| home(name, config), Path::to_path_buf);
             // The network itself is judged. What follows it in the node needs to know the camera's noise.
             let (resolution, refine) = (Resolution::Full, false);
             let config = Config { network: name.into(), models, resolution, refine, ..config.clone() };
@@ -159,6 +159,17 @@ impl Method {
         };
         Ok(Field { width, height, vectors, valid: None })
     }
+}
+
+/// Folder of models, under the one that holds the manifest, of networks that are there to be compared and not to be flown.
+const RECIPES: &str = "recipes";
+
+/// The folder of the models that has this network: the settings', or the one of recipes in it.
+fn home(name: &str, config: &Config) -> PathBuf {
+    let models = manifest::folder(&config.models, std::env::current_exe().ok().as_deref());
+    let beside = models.join(RECIPES);
+    let compared = manifest::entry(&models, name).is_err() && manifest::entry(&beside, name).is_ok();
+    if compared { beside } else { models }
 }
 
 /// A picture as the network takes it.

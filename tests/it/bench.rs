@@ -149,7 +149,7 @@ fn a_wrong_option_is_answered_with_the_right_one() {
     fs::write(&odd, "name,error\n").unwrap();
     let odd = odd.to_str().unwrap();
     let asked: [(&[&str], &str); 5] = [
-        (&["--models", "pwcnet"], "--models: pwcnet is no network, expected one of pwcnet_clean, pwcnet_fcdn, "),
+        (&["--models", "pwcnet"], "--models: pwcnet is no network, expected one of flownetc_clean, flownetc_fcdn, "),
         (&["--size", "320"], "expected WIDTHxHEIGHT of 16 to 4096 pixels each, as 320x256"),
         (&["--threads", "0"], "1..=256"),
         (&["--epe", odd], "--out <DIR>"),

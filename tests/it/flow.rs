@@ -289,18 +289,23 @@ fn every_cause_is_named_with_its_figure() {
 #[test]
 fn every_committed_network_passes_its_golden_check() {
     assert_eq!(real().model().name, "pwcnet_fcdn");
-    let manifest = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/models/manifest.toml")).unwrap();
-    for name in manifest.parse::<toml::Table>().unwrap().keys() {
-        let mut matcher = named(name);
-        let deviation = matcher.check_golden().unwrap().expect("the manifest holds a golden output");
-        assert!(deviation.worst <= deviation.tolerance);
-        let model = matcher.model();
-        assert_eq!(&model.name, name);
-        assert!(model.provider.starts_with("CPUExecutionProvider of ONNX Runtime 1."), "{model:?}");
-        assert!(
-            model.sha256.len() == 2
-                && model.sha256.iter().all(|(file, hash)| file.ends_with(".onnx") && hash.len() == 64)
-        );
+    let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("models");
+    // Those that are flown, and those that are there to be compared.
+    for folder in [models.clone(), models.join("recipes")] {
+        let manifest = fs::read_to_string(folder.join("manifest.toml")).unwrap();
+        for name in manifest.parse::<toml::Table>().unwrap().keys() {
+            let mut matcher =
+                Matcher::open(&Config { network: name.into(), models: folder.clone(), ..quarter() }).unwrap();
+            let deviation = matcher.check_golden().unwrap().expect("the manifest holds a golden output");
+            assert!(deviation.worst <= deviation.tolerance);
+            let model = matcher.model();
+            assert_eq!(&model.name, name);
+            assert!(model.provider.starts_with("CPUExecutionProvider of ONNX Runtime 1."), "{model:?}");
+            assert!(
+                model.sha256.len() == 2
+                    && model.sha256.iter().all(|(file, hash)| file.ends_with(".onnx") && hash.len() == 64)
+            );
+        }
     }
 }
 

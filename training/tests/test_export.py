@@ -132,12 +132,13 @@ def test_the_manifest_keeps_other_networks(fresh, tmp_path):
     assert sorted(tomllib.loads((tmp_path / "manifest.toml").read_text())) == ["one", "two"]
 
 
-def test_committed_files_are_those_of_the_manifest():
-    manifest = tomllib.loads((MODELS / "manifest.toml").read_text())
+@pytest.mark.parametrize("models", [MODELS, MODELS / "recipes"], ids=["flown", "recipes"])
+def test_committed_files_are_those_of_the_manifest(models):
+    manifest = tomllib.loads((models / "manifest.toml").read_text())
     assert manifest
     for entry in manifest.values():
         parts = ("pyramid", "decoder", "fused", "pyramid_bf16", "decoder_bf16")
-        paths = {part: MODELS / entry[part]["file"] for part in parts if part in entry}
+        paths = {part: models / entry[part]["file"] for part in parts if part in entry}
         for part, path in paths.items():
             assert hashlib.sha256(path.read_bytes()).hexdigest() == entry[part]["sha256"]
             assert path.stat().st_size <= 20_000_000

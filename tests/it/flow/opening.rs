@@ -57,7 +57,10 @@ fn a_missing_network_or_manifest_is_named() {
     let config = Config { models: folder.path().into(), network: "raft".into(), ..Config::default() };
     let text = Matcher::open(&config).map(drop).unwrap_err().to_string();
     assert!(
-        text.contains("network raft is not in it, it has pwcnet_clean, pwcnet_fcdn, pwcnet_fcdn_fast, raftsmall_fcdn"),
+        text.contains(
+            "network raft is not in it, it has flownetc_clean, flownetc_fcdn, flownets_clean, flownets_fcdn, pwcnet_clean, \
+             pwcnet_fcdn, pwcnet_fcdn_fast, raftsmall_fcdn"
+        ),
         "{text}"
     );
     fs::remove_file(folder.path().join("manifest.toml")).unwrap();
