@@ -144,7 +144,8 @@ pub fn markdown(report: &Report) -> String {
                 None => write!(text, " – |"),
             };
         }
-        let _ = writeln!(text, " {} |", row.lost().map_or("–".into(), |lost| format!("{lost:+.0} %")));
+        // Nought has no sign but plus.
+        let _ = writeln!(text, " {} |", row.lost().map_or("–".into(), |lost| format!("{:+.0} %", lost.round() + 0.0)));
     }
     text
 }
@@ -316,6 +317,11 @@ mod tests {
         assert_eq!((rows[2].network(), rows[2].trained()), ("flownets", "FCDN, authors 2021"));
         let text = markdown(&report);
         assert!(text.contains("| `pwcnet_clean` | clean | none | 3.00 ± 1.41 | 6.00 | +100 % |"), "{text}");
+        let still = markdown(&self::report(&[
+            ("a", "Exp-0", "none", "x_clean", 2.0),
+            ("a", "Exp-1", "none", "x_clean", 1.995),
+        ]));
+        assert!(still.contains("| 2.00 | 2.00 | +0 % |") || still.contains("| 2.00 | 1.99 | +0 % |"), "{still}");
         assert!(text.contains("| `flownets_authors2021` | FCDN, authors 2021 | NLM | 5.00 | – | – |"), "{text}");
     }
 
