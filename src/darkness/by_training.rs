@@ -179,7 +179,8 @@ pub fn plot(report: &Report) -> Result<String, Box<dyn std::error::Error>> {
         let panels = root.split_evenly((1, networks.len() + 1));
         let means = rows.iter().flat_map(|row| &row.cells).flatten().map(|seen| seen.mean).filter(|mean| *mean > 0.0);
         let (low, high) = means.fold((f64::MAX, 0.0f64), |(low, high), mean| (low.min(mean), high.max(mean)));
-        let range = if high > 0.0 { low / 1.1..high * 1.1 } else { 0.1..10.0 };
+        // One scale for all, so that networks can be compared; from nought the differences would not be seen.
+        let range = if high > 0.0 { 0.9 * low..1.03 * high } else { 0.0..1.0 };
         for (network, panel) in networks.iter().zip(&panels) {
             let own: Vec<&Row> = rows.iter().filter(|row| row.network() == *network).collect();
             draw(panel, network, &own, report.conditions.len(), &range)?;
@@ -225,11 +226,12 @@ fn draw(
         .margin(8)
         .x_label_area_size(36)
         .y_label_area_size(44)
-        .build_cartesian_2d(-0.2..last + 0.2, (range.start..range.end).log_scale())?;
+        .build_cartesian_2d(-0.2..last + 0.2, range.clone())?;
     chart
         .configure_mesh()
         .light_line_style(WHITE)
         .x_labels(conditions)
+        .y_labels(8)
         .x_label_formatter(&|at| format!("{at:.0}"))
         .y_label_formatter(&|value| format!("{value:.1}"))
         .x_desc("Exp")

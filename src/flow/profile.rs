@@ -30,21 +30,26 @@ struct Event {
 ///
 /// The record itself costs some microseconds a node. Frames take turns; three or more of one size are needed for the pyramid to
 /// have one new frame a step, as in the node.
-pub fn profile(config: &Config, frames: &[Exposed], steps: usize) -> Result<BTreeMap<String, f64>, Error> {
-    let folder = std::env::temp_dir().join(format!("nightflow_profile_{}", std::process::id()));
+/// The record is written into `folder`, which is made and, once it is read, removed.
+pub fn profile(
+    config: &Config,
+    frames: &[Exposed],
+    steps: usize,
+    folder: &Path,
+) -> Result<BTreeMap<String, f64>, Error> {
     let failed = |path: &Path| {
         let path = path.to_path_buf();
         move |error: std::io::Error| Error::Profile { path, reason: error.to_string() }
     };
-    fs::create_dir_all(&folder).map_err(failed(&folder))?;
-    let recorded = record(config, frames, steps, &folder);
+    fs::create_dir_all(folder).map_err(failed(folder))?;
+    let recorded = record(config, frames, steps, folder);
     let found = recorded.and_then(|files| {
         files.iter().try_fold(BTreeMap::new(), |sums, file| {
             let text = fs::read_to_string(file).map_err(failed(file))?;
             read(&text, sums).map_err(|error| Error::Profile { path: file.clone(), reason: error.to_string() })
         })
     });
-    fs::remove_dir_all(&folder).map_err(failed(&folder))?;
+    fs::remove_dir_all(folder).map_err(failed(folder))?;
     found
 }
 

@@ -273,16 +273,18 @@ fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, Str
     })?;
     bar.finish_and_clear();
     found.sort_by_key(|(at, _)| *at);
-    let mut whole = Report { about, skipped, faults, ..Report::default() };
-    for (_, part) in found {
-        for known in part.conditions {
-            whole.knows(known);
-        }
+    Ok(gathered(Report { about, skipped, faults, ..Report::default() }, found.into_iter().map(|(_, part)| part)))
+}
+
+/// All parts in one report, in their order.
+fn gathered(mut whole: Report, parts: impl Iterator<Item = Report>) -> Report {
+    for part in parts {
+        part.conditions.into_iter().for_each(|known| whole.knows(known));
         whole.records.extend(part.records);
         whole.limits.extend(part.limits);
         whole.skipped.extend(part.skipped);
     }
-    Ok(whole)
+    whole
 }
 
 /// What a worker judges and what it puts before it.

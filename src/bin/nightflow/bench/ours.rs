@@ -61,7 +61,8 @@ const CONVOLVING: [&str; 6] = ["Conv", "FusedConv", "ConvTranspose", "QLinearCon
 
 /// Milliseconds that the convolutions of a step take by themselves.
 pub fn convolutions(config: &Config, frames: &[Exposed], rounds: usize) -> Result<f64> {
-    let taken = profile::profile(config, frames, rounds)?;
+    let folder = std::env::temp_dir().join(format!("nightflow_profile_{}", std::process::id()));
+    let taken = profile::profile(config, frames, rounds, &folder)?;
     Ok(CONVOLVING.iter().filter_map(|operator| taken.get(*operator)).sum())
 }
 
