@@ -267,9 +267,9 @@ def traced(
     return onnx.load_from_string(memory.getvalue())
 
 
-def graphs_of(network: nn.Module) -> dict[str, onnx.ModelProto]:
-    """`pyramid` and `decoder` graphs of a network in evaluation mode; of a PWC-Net also `fused`, the decoder with the node's own
-    cost volume, and `pyramid_bf16` and `decoder_bf16` with its convolutions too."""
+def graphs_of(network: nn.Module, plain: bool = False) -> dict[str, onnx.ModelProto]:
+    """`pyramid` and `decoder` graphs of a network in evaluation mode; of a PWC-Net, unless only `plain` ones are wanted, also
+    `fused`, the decoder with the node's own cost volume, and `pyramid_bf16` and `decoder_bf16` with its convolutions too."""
     graphs = next(graphs for kind, graphs in GRAPHS.items() if isinstance(network, kind))
     frame, pair = (graph(network).eval() for graph in graphs)
     image = torch.rand(1, 3, GOLDEN_HEIGHT, GOLDEN_WIDTH)
@@ -295,7 +295,7 @@ def graphs_of(network: nn.Module) -> dict[str, onnx.ModelProto]:
         )
 
     graphs = {"pyramid": pyramid(), "decoder": decoder()}
-    if isinstance(network, PwcNet):
+    if isinstance(network, PwcNet) and not plain:
         own = {DOMAIN: DOMAIN_VERSION}
         with fused(network):
             graphs["fused"] = decoder(own)
@@ -439,9 +439,7 @@ def export(arguments: argparse.Namespace, network: nn.Module, state: dict, name:
     """Writes, checks and enters one network. Those with the same weights share the pyramid's file."""
     network.eval().load_state_dict(state["mean"])
     files = {}
-    for part, graph in graphs_of(network).items():
-        if arguments.plain and part not in ("pyramid", "decoder"):
-            continue
+    for part, graph in graphs_of(network, arguments.plain).items():
         # Those with the same weights share what looks at one frame.
         owner = arguments.name if part.startswith("pyramid") else name
         file = f"{owner}_{'decoder_fused' if part == 'fused' else part}"

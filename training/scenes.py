@@ -248,17 +248,17 @@ class Bank:
     def kept(cls, file: Path, textures: Textures, seed: int, **described):
         """The bank in a file, which is made if there is none, so that runs and their legs share it. The random numbers of who
         asks go on as if there were no bank."""
-        described |= {"seed": seed}
+        known = described | {"seed": seed}
         if not file.exists():
             with torch.random.fork_rng():
                 torch.manual_seed(seed)
-                made = cls.made(textures, **{key: value for key, value in described.items() if key != "seed"})
+                made = cls.made(textures, **described)
             beside = file.with_name(file.name + ".part")
-            torch.save({"described": described, "frames": made.frames.cpu(), "flow": made.flow.cpu()}, beside)
+            torch.save({"described": known, "frames": made.frames.cpu(), "flow": made.flow.cpu()}, beside)
             beside.rename(file)
         held = torch.load(file, weights_only=True, mmap=True, map_location="cpu")
-        if held["described"] != described:
-            raise ValueError(f"{file}: expected a bank of {described}, found one of {held['described']}")
+        if held["described"] != known:
+            raise ValueError(f"{file}: expected a bank of {known}, found one of {held['described']}")
         return cls(held["frames"], held["flow"])
 
     def draw(self, batch: int, height: int, width: int):

@@ -4,7 +4,10 @@ use std::fmt::Write as _;
 
 use plotters::{coord::Shift, prelude::*};
 
-use super::report::{DRAW, Record, Report};
+use super::{
+    report::{DRAW, Record, Report},
+    score::Spread,
+};
 
 /// What the last part of a network's name says that it was trained on.
 pub const TRAINED: [(&str, &str); 5] = [
@@ -87,10 +90,8 @@ fn seen(records: &[&Record]) -> Option<Seen> {
         sum / f64::from(count)
     };
     let means: Vec<f64> = draws.into_iter().map(of).collect();
-    let count = means.len() as f64;
-    let mean = means.iter().sum::<f64>() / count;
-    let squares: f64 = means.iter().map(|value| (value - mean).powi(2)).sum();
-    (count > 0.0).then(|| Seen { mean, deviation: (squares / (count - 1.0)).sqrt() })
+    let spread = Spread::of(&means)?;
+    Some(Seen { mean: spread.mean, deviation: spread.error * (spread.count as f64).sqrt() })
 }
 
 /// A row for every network and enhancer, in the order in which they first came, networks together.

@@ -29,8 +29,7 @@ struct Event {
 /// to frame, the first of which does not count, the median of each node, summed over the nodes of a kind.
 ///
 /// The record itself costs some microseconds a node. Frames take turns; three or more of one size are needed for the pyramid to
-/// have one new frame a step, as in the node.
-/// The record is written into `folder`, which is made and, once it is read, removed.
+/// have one new frame a step, as in the node. The record is written into `folder`, which is made and, once it is read, removed.
 pub fn profile(
     config: &Config,
     frames: &[Exposed],

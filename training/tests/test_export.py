@@ -9,8 +9,10 @@ import onnx
 import pytest
 import torch
 
+import int8
 from export import (GOLDEN_COLUMNS, GOLDEN_ROWS, OPSET, Exported, gigamacs, golden_frames, graphs_of, manifest_entry,
                     moved, parity, rounded, write_manifest)
+from flownet import FlowNetS
 from networks import PwcNet
 from raft import RaftSmall
 
@@ -35,6 +37,28 @@ def test_graphs_equal_pytorch(fresh, height, width):
     assert parity(network, exported, *moved(height, width, 1)) < 1e-3
     random = np.random.default_rng(0)
     assert parity(network, exported, *(random.random((1, 3, height, width), np.float32) for _ in range(2))) < 1e-3
+
+
+def test_plain_graphs_have_no_operators_of_the_nodes_own():
+    graphs = graphs_of(PwcNet().eval(), plain=True)
+    assert list(graphs) == ["pyramid", "decoder"]
+    assert {node.domain for graph in graphs.values() for node in graph.graph.node} == {""}
+
+
+def test_int8_graphs_stay_near_and_come_with_a_manifest(packed, tmp_path, monkeypatch):
+    torch.manual_seed(0)
+    for part, graph in graphs_of(FlowNetS(0.125).eval()).items():
+        (tmp_path / f"small_{part}.onnx").write_bytes(graph.SerializeToString())
+    given = ["--name", "small", "--models", str(tmp_path), "--photographs", str(packed), "--count", "2", "--keep", "predict"]
+    monkeypatch.setattr("sys.argv", ["int8.py", str(tmp_path / "int8"), *given])
+    int8.main()
+    entry = tomllib.loads((tmp_path / "int8" / "manifest.toml").read_text())["small_int8"]
+    files = [tmp_path / "int8" / entry[part]["file"] for part in ("pyramid", "decoder")]
+    assert all("QuantizeLinear" in {node.op_type for node in onnx.load(file).graph.node} for file in files)
+    pair = golden_frames()
+    plain = Exported(*(str(tmp_path / f"small_{part}.onnx") for part in ("pyramid", "decoder")))(*pair)[0]
+    found = Exported(*map(str, files))(*pair)[0]
+    assert 0 < np.abs(found - plain).max() < 0.2 * np.abs(plain).max()
 
 
 def test_scale_multiplies_flow_but_not_the_expected_error(fresh):

@@ -79,15 +79,8 @@ The limit is the Cramér–Rao bound of a square of 15 pixels (--patch) around e
 struct LadderArgs {
     /// A data set with true flow, or any folder of NAME_img1.*, NAME_img2.*, NAME_flow.flo; sRGB pictures.
     pairs: PathBuf,
-    /// The camera whose measured noise is drawn.
-    #[arg(long, default_value = "Canon EOS M6")]
-    camera: String,
-    /// Its sensitivity.
-    #[arg(long, default_value_t = 3200)]
-    iso: u32,
-    /// The same seed gives the same bits.
-    #[arg(long, default_value_t = 1)]
-    seed: u64,
+    #[command(flatten)]
+    night: Night,
     /// How often each exposure is drawn; a pair's draws are averaged before the pairs are.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=100))]
     draws: u32,
@@ -115,15 +108,36 @@ struct How {
     /// The layout, where it can't be told from the folder: vbof, pairs, middlebury, sintel, kitti.
     #[arg(long, value_parser = kind)]
     layout: Option<Kind>,
-    /// Only pairs whose name contains this.
-    #[arg(long, value_name = "TEXT")]
-    only: Option<String>,
     /// Write table.md, table.csv, table.json and epe.svg into this folder.
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Write the very pixels that methods see: ENHANCER/CONDITION/PAIR_img1.png and _img2.png.
     #[arg(long, value_name = "DIR")]
     write: Option<PathBuf>,
+    #[command(flatten)]
+    work: Work,
+}
+
+/// The camera of a ladder.
+#[derive(clap::Args)]
+struct Night {
+    /// The camera whose measured noise is drawn.
+    #[arg(long, default_value = "Canon EOS M6")]
+    camera: String,
+    /// Its sensitivity.
+    #[arg(long, default_value_t = 3200)]
+    iso: u32,
+    /// The same seed gives the same bits.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+}
+
+/// On what, and how, it is computed.
+#[derive(clap::Args, Clone)]
+struct Work {
+    /// Only pairs whose name contains this.
+    #[arg(long, value_name = "TEXT")]
+    only: Option<String>,
     /// Threads of the networks.
     #[arg(long, default_value_t = 2)]
     threads: usize,
@@ -150,7 +164,10 @@ pub fn run(args: Args) -> Result<Exit> {
     match (args.sub, args.dataset) {
         (Some(Sub::Recipes(args)), _) => recipes::run(args),
         (Some(Sub::Reference(args)), _) => reference::run(&args),
-        (Some(Sub::Ladder(ladder)), _) => publish(&descended(&ladder, Some(ladder.patch))?, &ladder.how),
+        (Some(Sub::Ladder(ladder)), _) => {
+            let (light, about) = ladder.night.light(&ladder.faults, Some(ladder.patch), ladder.draws)?;
+            publish(&evaluate(&ladder.pairs, &light, &ladder.how, about, ladder.draws)?, &ladder.how)
+        }
         (None, Some(dataset)) => {
             let light = if args.linear { Light::Linear } else { Light::AsItIs };
             publish(&evaluate(&dataset, &light, &args.how, vec![], 1)?, &args.how)
@@ -159,28 +176,28 @@ pub fn run(args: Args) -> Result<Exit> {
     }
 }
 
-/// What a ladder finds, with the limit for a square of so many pixels if that is asked for.
-fn descended(ladder: &LadderArgs, patch: Option<usize>) -> Result<Report> {
-    if let Some(patch) = patch.filter(|patch| patch.is_multiple_of(2)) {
-        bail!("--patch is {patch}; expected an odd number of pixels, as 15");
-    }
-    let sensor = Sensor::find(&ladder.camera, ladder.iso)?;
-    let mut about = vec![(
-        "camera".to_owned(),
-        format!("{} at ISO {}, seed {}, draws a pair: {}", ladder.camera, ladder.iso, ladder.seed, ladder.draws),
-    )];
-    about.extend(patch.map(|side| ("limit".into(), format!("Cramér–Rao, a square of {side} × {side} pixels"))));
-    let mut faults: Vec<Fault> = vec![];
-    for fault in &ladder.faults {
-        if !faults.contains(fault) {
-            faults.push(*fault);
+impl Night {
+    /// The ladder of this camera, with the limit for a square of so many pixels if that is asked for; and what to say of it.
+    fn light(&self, given: &[Fault], patch: Option<usize>, draws: u32) -> Result<(Light, Vec<(String, String)>)> {
+        if let Some(patch) = patch.filter(|patch| patch.is_multiple_of(2)) {
+            bail!("--patch is {patch}; expected an odd number of pixels, as 15");
         }
+        let Self { camera, iso, seed } = self;
+        let sensor = Sensor::find(camera, *iso)?;
+        let said = format!("{camera} at ISO {iso}, seed {seed}, draws a pair: {draws}");
+        let mut about = vec![("camera".to_owned(), said)];
+        about.extend(patch.map(|side| ("limit".into(), format!("Cramér–Rao, a square of {side} × {side} pixels"))));
+        let mut faults: Vec<Fault> = vec![];
+        for fault in given {
+            if !faults.contains(fault) {
+                faults.push(*fault);
+            }
+        }
+        if faults != [Fault::None] {
+            about.extend(faults.iter().map(|fault| (format!("noise {fault}"), fault.about().to_owned())));
+        }
+        Ok((Light::Ladder { sensor, seed: *seed, patch, faults }, about))
     }
-    if faults != [Fault::None] {
-        about.extend(faults.iter().map(|fault| (format!("noise {fault}"), fault.about().to_owned())));
-    }
-    let light = Light::Ladder { sensor, seed: ladder.seed, patch, faults };
-    evaluate(&ladder.pairs, &light, &ladder.how, about, ladder.draws)
 }
 
 /// In what light the pairs are shown.
@@ -215,15 +232,19 @@ fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, Str
     if kind == Kind::Vbof && matches!(light, Light::Ladder { .. }) {
         bail!("{} has been photographed in the dark already; a ladder wants bright sRGB pairs", folder.display());
     }
-    if let Some(text) = &how.only {
+    if let Some(text) = &how.work.only {
         items.retain(|item| item.name.contains(text));
         skipped.retain(|left| left.what.contains(text));
     }
     if items.is_empty() && skipped.is_empty() {
-        bail!("{} has no pair{}", folder.display(), how.only.as_ref().map_or(String::new(), |t| format!(" named {t}")));
+        bail!(
+            "{} has no pair{}",
+            folder.display(),
+            how.work.only.as_ref().map_or(String::new(), |t| format!(" named {t}"))
+        );
     }
-    let config = flow::Config { threads: how.threads, ..launch::read(how.config.as_deref())?.flow };
-    let first = Bench::open(how, &config)?;
+    let config = flow::Config { threads: how.work.threads, ..launch::read(how.work.config.as_deref())?.flow };
+    let first = Judges::open(how, &config)?;
     let layout = KINDS.iter().find(|(_, known)| *known == kind).map_or("", |(name, _)| name);
     about.insert(0, ("data".into(), format!("{} ({layout}), {} pairs", folder.display(), items.len())));
     about.extend(first.methods.iter().map(|method| (method.name.clone(), method.about())));
@@ -241,7 +262,7 @@ fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, Str
     let empty = Report { faults: faults.clone(), ..Report::default() };
     let next = AtomicUsize::new(0);
     // Each worker takes the next pair, and what is found is put together in the order of the pairs.
-    let work = |mut bench: Bench| -> Result<Vec<(usize, Report)>> {
+    let work = |mut judges: Judges| -> Result<Vec<(usize, Report)>> {
         let mut found = vec![];
         loop {
             let at = next.fetch_add(1, Ordering::Relaxed);
@@ -251,7 +272,7 @@ fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, Str
             match datasets::load(item) {
                 Ok(loaded) => {
                     for view in views(item, loaded, light) {
-                        judge(item, view?, &mut bench, how, &mut report, &bar)?;
+                        judge(item, view?, &mut judges, how, &mut report, &bar)?;
                     }
                 }
                 Err(left) => {
@@ -262,9 +283,9 @@ fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, Str
             found.push((at, report));
         }
     };
-    let more = (1..how.workers).map(|_| Bench::open(how, &config)).collect::<Result<Vec<_>>>()?;
+    let more = (1..how.work.workers).map(|_| Judges::open(how, &config)).collect::<Result<Vec<_>>>()?;
     let mut found = std::thread::scope(|scope| -> Result<Vec<(usize, Report)>> {
-        let others: Vec<_> = more.into_iter().map(|bench| scope.spawn(|| work(bench))).collect();
+        let others: Vec<_> = more.into_iter().map(|judges| scope.spawn(|| work(judges))).collect();
         let mut found = work(first)?;
         for other in others {
             found.extend(other.join().map_err(|_| anyhow::anyhow!("a worker of the evaluation panicked"))??);
@@ -288,12 +309,12 @@ fn gathered(mut whole: Report, parts: impl Iterator<Item = Report>) -> Report {
 }
 
 /// What a worker judges and what it puts before it.
-struct Bench {
+struct Judges {
     methods: Vec<Method>,
     enhancers: Vec<Enhancing>,
 }
 
-impl Bench {
+impl Judges {
     fn open(how: &How, config: &flow::Config) -> Result<Self> {
         let methods = how.models.iter().map(|given| Method::open(given, config)).collect::<Result<Vec<_>, _>>()?;
         let enhancers = how.enhancers.iter().cloned().map(|by| Enhancing::open(by, config));
@@ -328,7 +349,14 @@ fn views(item: &Item, loaded: datasets::Loaded, light: &Light) -> impl Iterator<
 }
 
 /// Every enhancer and method on one view of a pair.
-fn judge(item: &Item, view: View, bench: &mut Bench, how: &How, report: &mut Report, bar: &ProgressBar) -> Result<()> {
+fn judge(
+    item: &Item,
+    view: View,
+    judges: &mut Judges,
+    how: &How,
+    report: &mut Report,
+    bar: &ProgressBar,
+) -> Result<()> {
     let ladder = view.condition != item.condition;
     // Where the truth comes in several kinds, they are what the table is sorted by.
     let sorted = |truth: &str| match (ladder, view.truths.len()) {
@@ -346,14 +374,14 @@ fn judge(item: &Item, view: View, bench: &mut Bench, how: &How, report: &mut Rep
         fault => format!("{} {fault}", view.condition),
     };
     let folder = light.replace([' ', '/'], "_");
-    for enhancing in &mut bench.enhancers {
+    for enhancing in &mut judges.enhancers {
         let by = enhancing.by.to_string();
         let frames = [enhancing.enhance(&view.frames[0])?, enhancing.enhance(&view.frames[1])?];
         let place = Path::new(&by).join(&folder).join(format!("{}_flow.flo", item.name));
         if let Some(root) = &how.write {
             write(&root.join(&by).join(&folder), &item.name, &frames)?;
         }
-        for method in bench.methods.iter_mut().filter(|method| method.covers(&enhancing.by)) {
+        for method in judges.methods.iter_mut().filter(|method| method.covers(&enhancing.by)) {
             let shown = Shown { frames: [&frames[0], &frames[1]], place: &place };
             let what = format!("{} by {} ({by}, {light})", item.name, method.name);
             let found = match method.flow(&shown) {
@@ -402,16 +430,27 @@ fn publish(report: &Report, how: &How) -> Result<Exit> {
     let markdown = report.markdown();
     print!("{markdown}");
     if let Some(folder) = &how.out {
-        std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
-        let plot = report.plot().map_err(|error| anyhow::anyhow!("the plot can't be drawn: {error}"))?;
-        for (name, text) in
-            [("table.md", markdown), ("table.csv", report.csv()), ("table.json", report.json()?), ("epe.svg", plot)]
-        {
-            let path = folder.join(name);
-            std::fs::write(&path, text).with_context(|| path.display().to_string())?;
-        }
+        let plot = report.plot().map_err(undrawn)?;
+        let files =
+            [("table.md", markdown), ("table.csv", report.csv()), ("table.json", report.json()?), ("epe.svg", plot)];
+        put(folder, files.map(|(name, text)| (name.to_owned(), text)))?;
     }
     Ok(if report.skipped.is_empty() { Exit::Done } else { Exit::DataLost })
+}
+
+/// The drawing library's errors have no common type.
+fn undrawn(error: Box<dyn std::error::Error>) -> anyhow::Error {
+    anyhow::anyhow!("the plot can't be drawn: {error}")
+}
+
+/// Writes files of text into a folder, which is made if there is none.
+fn put<const COUNT: usize>(folder: &Path, files: [(String, String); COUNT]) -> Result<()> {
+    std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+    for (name, text) in files {
+        let path = folder.join(name);
+        std::fs::write(&path, text).with_context(|| path.display().to_string())?;
+    }
+    Ok(())
 }
 
 fn progress(steps: usize) -> Result<ProgressBar> {

@@ -8,7 +8,7 @@ use std::{
 use anyhow::{Context, Result, bail};
 use nightflow::darkness::{by_training, enhance::Enhancer, faults::Fault, report::Report};
 
-use super::{How, LadderArgs, bound, descended, workers};
+use super::{How, Night, Work, evaluate, put, undrawn};
 use crate::Exit;
 
 /// The table that the paper made: every network by what it was trained on (clean, FCDN by the paper's recipe, by the
@@ -28,15 +28,8 @@ pub struct Args {
     /// Data sets with true flow, or folders of NAME_img1.*, NAME_img2.*, NAME_flow.flo; sRGB pictures.
     #[arg(required = true)]
     sets: Vec<PathBuf>,
-    /// The camera whose measured noise is drawn.
-    #[arg(long, default_value = "Canon EOS M6")]
-    camera: String,
-    /// Its sensitivity.
-    #[arg(long, default_value_t = 3200)]
-    iso: u32,
-    /// The same seed gives the same bits.
-    #[arg(long, default_value_t = 1)]
-    seed: u64,
+    #[command(flatten)]
+    night: Night,
     /// How often the noise of each exposure is drawn: the spread is over these.
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=100))]
     draws: u32,
@@ -46,21 +39,11 @@ pub struct Args {
     /// What frames go through first.
     #[arg(long, value_delimiter = ',', default_value = "none,nlm,gaussian:2")]
     enhancers: Vec<Enhancer>,
-    /// Only pairs whose name contains this.
-    #[arg(long, value_name = "TEXT")]
-    only: Option<String>,
     /// Write the tables, the pictures and every figure into this folder.
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Threads of the networks.
-    #[arg(long, default_value_t = 2)]
-    threads: usize,
-    /// Pairs judged at a time, each on --threads of its own: two of one thread are faster than one of two.
-    #[arg(long, default_value_t = 1, value_parser = workers)]
-    workers: usize,
-    /// A launch file whose [flow] says with what networks are computed: runtime, provider, precision, operators, models.
-    #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
+    #[command(flatten)]
+    work: Work,
 }
 
 /// Networks of the paper by all that they were trained on.
@@ -79,30 +62,12 @@ pub fn run(args: Args) -> Result<Exit> {
     if let Some(twice) = names.iter().enumerate().find(|(at, name)| names[..*at].contains(name)) {
         bail!("two sets are called {}; expected folders of different names", twice.1);
     }
+    let (light, about) = args.night.light(&[Fault::None], None, args.draws)?;
+    let how =
+        How { models: args.models, enhancers: args.enhancers, layout: None, out: None, write: None, work: args.work };
     let mut ended = Exit::Done;
     for (set, name) in args.sets.iter().zip(&names) {
-        let how = How {
-            models: args.models.clone(),
-            enhancers: args.enhancers.clone(),
-            layout: None,
-            only: args.only.clone(),
-            out: None,
-            write: None,
-            threads: args.threads,
-            workers: args.workers,
-            config: args.config.clone(),
-        };
-        let ladder = LadderArgs {
-            pairs: set.clone(),
-            camera: args.camera.clone(),
-            iso: args.iso,
-            seed: args.seed,
-            draws: args.draws,
-            faults: vec![Fault::None],
-            patch: bound::PATCH,
-            how,
-        };
-        let report = descended(&ladder, None)?;
+        let report = evaluate(set, &light, &how, about.clone(), args.draws)?;
         if !report.skipped.is_empty() {
             ended = Exit::DataLost;
         }
@@ -131,11 +96,7 @@ fn told(name: &str, report: &Report) -> String {
 }
 
 fn write(folder: &Path, name: &str, text: &str, report: &Report) -> Result<()> {
-    std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
-    let plot = by_training::plot(report).map_err(|error| anyhow::anyhow!("the plot can't be drawn: {error}"))?;
-    for (ending, text) in [("md", text), ("json", &report.json()?), ("svg", &plot)] {
-        let path = folder.join(format!("recipes_{name}.{ending}"));
-        std::fs::write(&path, text.trim_start()).with_context(|| path.display().to_string())?;
-    }
-    Ok(())
+    let plot = by_training::plot(report).map_err(undrawn)?;
+    let files = [("md", text.trim_start().to_owned()), ("json", report.json()?), ("svg", plot)];
+    put(folder, files.map(|(ending, text)| (format!("recipes_{name}.{ending}"), text)))
 }
