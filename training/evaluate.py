@@ -111,16 +111,16 @@ def reliability_table(scores: dict[int, Scores]) -> list[str]:
     return [*lines, ""]
 
 
-def curve_picture(log: Path, target: Path) -> None:
-    """The learning curve as an SVG: error by noise level against minutes."""
+def curve_picture(log: Path, target: Path, against: str = "minutes") -> None:
+    """The learning curve as an SVG: error by noise level against minutes or, where legs ran on unlike machines, against steps."""
     with open(log) as file:
         rows = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
     width, height, left, bottom = 640, 320, 50, 40
     names = [key for key in rows[0] if key.startswith("epe_")]
-    longest, highest = max(r["minutes"] for r in rows), 1.05 * max(r[key] for r in rows for key in names)
+    longest, highest = max(r[against] for r in rows), 1.05 * max(r[key] for r in rows for key in names)
 
-    def place(minutes: float, error: float) -> tuple[float, float]:
-        x = left + minutes / longest * (width - left - 130)
+    def place(done: float, error: float) -> tuple[float, float]:
+        x = left + done / longest * (width - left - 130)
         return x, height - bottom - error / highest * (height - bottom - 10)
 
     parts = [
@@ -132,15 +132,15 @@ def curve_picture(log: Path, target: Path) -> None:
         (x0, y), (x1, _) = place(0, error), place(longest, error)
         parts.append(f'<path d="M{x0:.1f} {y:.1f}H{x1:.1f}" stroke="#ddd"/>')
         parts.append(f'<text x="{x0 - 24}" y="{y + 4:.1f}">{error}</text>')
-    for minute in range(0, int(longest) + 1, 10):
-        x, y = place(minute, 0)
-        parts.append(f'<text x="{x - 6:.1f}" y="{y + 16:.1f}">{minute}</text>')
-    parts.append(f'<text x="{left + 130}" y="{height - 8}">minutes of training</text>')
+    for mark in range(0, int(longest) + 1, 10 if against == "minutes" else 2000):
+        x, y = place(mark, 0)
+        parts.append(f'<text x="{x - 6:.1f}" y="{y + 16:.1f}">{mark}</text>')
+    parts.append(f'<text x="{left + 130}" y="{height - 8}">{"minutes" if against == "minutes" else "steps"} of training</text>')
     parts.append('<text x="4" y="12">px</text>')
     colours = ("#1b7837", "#2166ac", "#b2182b", "#000000", "#e08214")
     for i, (key, colour) in enumerate(zip(names, colours)):
         name = key.replace("epe_", "noise ")
-        points = " ".join("{:.1f},{:.1f}".format(*place(r["minutes"], r[key])) for r in rows)
+        points = " ".join("{:.1f},{:.1f}".format(*place(r[against], r[key])) for r in rows)
         parts.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.5"/>')
         parts.append(f'<text x="{width - 120}" y="{20 + 18 * i}" fill="{colour}">{name}: {rows[-1][key]:.2f}</text>')
     target.write_text("\n".join([*parts, "</svg>"]) + "\n")
@@ -154,6 +154,7 @@ def main() -> None:
     parser.add_argument("--photographs", type=Path, default=Path("runs/photographs.npz"))
     parser.add_argument("--public", type=Path, help="folder of public pairs with ground truth (judging only)")
     parser.add_argument("--log", type=Path, default=Path("runs/fcdn/log.csv"))
+    parser.add_argument("--against", choices=("minutes", "step"), default="minutes", help="what the learning curve is drawn against")
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()
@@ -182,7 +183,7 @@ def main() -> None:
                     dark = noisy(*linear(older, newer, jitter=False), level)
                     score.add(graphs, *dark, truth[0].permute(1, 2, 0).numpy())
             lines += error_table(title, scores, len(chosen))
-    curve_picture(arguments.log, arguments.models / f"{arguments.name}_curve.svg")
+    curve_picture(arguments.log, arguments.models / f"{arguments.name}_curve.svg", arguments.against)
     (arguments.models / f"{arguments.name}_evaluation.md").write_text("\n".join(lines))
     print("\n".join(lines))
 

@@ -87,6 +87,11 @@ def cost_volume(older: torch.Tensor, newer: torch.Tensor, tile: int | None, reac
     return band.permute(0, 1, 5, 2, 3, 4).reshape(batch, side * side, height, width)
 
 
+def columns(level: int, device: torch.device) -> int | None:
+    """Columns of a tile at a level. A GPU takes a row as one: it would rather multiply more than be given many small matrices."""
+    return None if device.type == "cuda" else TILES.get(level)
+
+
 def warp(features: torch.Tensor, flow: torch.Tensor) -> torch.Tensor:
     """Newer features [B, C, H, W] fetched to where the flow [B, 2, H, W] (pixels of this level) says they went."""
     height, width = features.shape[-2:]
@@ -210,14 +215,14 @@ class Decoder(nn.Module):
                 above = F.interpolate(above, scale_factor=2, mode="bilinear", align_corners=False)
             for _ in range(looks):
                 fetch = len(flows) > 0
-                flow, above = self.shared(*matched[level], flow, above, TILES.get(level), fetch)
+                flow, above = self.shared(*matched[level], flow, above, columns(level, flow.device), fetch)
                 flows.append(flow)
         flows[-1] = flow = flow + self.through(self.context, [above, (0.25 * flow).to(above.dtype)]).float()
         flow = 2.0 * twice(flow)
         coarser = F.softplus(self.through(self.fast_error, [above.detach()]).float()) + 0.01 if fast or self.training else None
         if fast:
             return [*flows, flow], twice(coarser)
-        flow, features = self.fine(older[0], newer[0], older[0], flow, twice(above), TILES[2])
+        flow, features = self.fine(older[0], newer[0], older[0], flow, twice(above), columns(2, flow.device))
         expected = F.softplus(self.through(self.error, [features.detach()]).float()) + 0.01
         return [*flows, flow], [coarser, expected] if self.training else expected
 

@@ -114,16 +114,16 @@ def unprocess(first, second, matrix, gain, a, b):
 
 def batch_of(
     textures: Textures | Bank, height: int, width: int, level: torch.Tensor | None, mixture=MIXTURE, batch: int = 4,
-    recipe: str = "paper",
+    recipe: str = "paper", **kind,
 ):
     """A training batch: older, newer [B, 3, H, W] and the flow [B, 2, H, W]. By the recipe `paper` one pair for each
     noise level, or `batch` clean ones; the others draw their own noise for `batch` pairs, and what they make is not
-    brought to a mean. A bank has its own mixture."""
+    brought to a mean. `kind` is what `scene` is told of its shapes. A bank has its own mixture."""
     batch = batch if level is None else len(level)
     if isinstance(textures, Bank):
         first, second, flow = textures.draw(batch, height, width)
     else:
-        first, second, flow = scene(textures, batch, height, width, mixture)
+        first, second, flow = scene(textures, batch, height, width, mixture, **kind)
     if recipe == "authors-2021":
         return *authors(first, second, *authors_drawn(batch)), flow
     if recipe == "unprocess":
@@ -135,20 +135,25 @@ def batch_of(
 
 
 class HeldOut:
-    """A fixed set of clean pairs from photographs that training never sees, and their noisy versions."""
+    """A fixed set of clean pairs from photographs that training never sees, and their noisy versions. Drawn on the CPU and
+    then brought to the default device, so that it is the same on every kind of machine."""
 
     def __init__(self, packed: Path, count: int, height: int = 256, width: int = 320, seed: int = 7):
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            textures = Textures(packed, held_out=True)
-            parts = [batch_of(textures, height, width, None) for _ in range(-(-count // 4))]
-        self.first, self.second, self.flow = (torch.cat(p)[:count] for p in zip(*parts))
+            with torch.device("cpu"):
+                textures = Textures(packed, held_out=True)
+                parts = [batch_of(textures, height, width, None) for _ in range(-(-count // 4))]
+        self.drawn = [torch.cat(p)[:count] for p in zip(*parts)]
+        self.first, self.second, self.flow = (part.to(torch.get_default_device()) for part in self.drawn)
 
     def at(self, level: float, seed: int = 11):
         """Older and newer frames at a noise level of 0...30."""
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            return noisy(self.first, self.second, level)
+            with torch.device("cpu"):
+                pair = noisy(*self.drawn[:2], level)
+            return tuple(frame.to(self.first.device) for frame in pair)
 
 
 def read_flo(path: Path) -> np.ndarray:

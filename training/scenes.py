@@ -19,6 +19,8 @@ HELD_OUT = 20
 # Least mean step between every fourth row of a window, in 1/255.
 DULL = 8.0
 THIN = 4
+# How many cut-out shapes a scene has at most; each is there three times in four.
+SHAPES = 5
 # Share, least and greatest typical displacement in pixels.
 MIXTURE = ((0.05, 0.0, 0.0), (0.40, 0.2, 4.0), (0.35, 4.0, 12.0), (0.20, 12.0, 28.0))
 
@@ -50,6 +52,8 @@ class Textures:
         with np.load(packed) as file:
             held = file["owners"] >= file["owners"].max() + 1 - HELD_OUT
             self.squares = torch.as_tensor(file["squares"][held == held_out], device=torch.get_default_device())
+        # A GPU fetches words much faster than triples of bytes.
+        self.words = F.pad(self.squares, (0, 1)).view(torch.int32).flatten() if self.squares.is_cuda else None
         thin = self.squares[:, ::THIN, ::THIN].float()
         steps = (thin[:, 1:] - thin[:, :-1]).abs().mean(3)
         # Sums over all rectangles that begin at the corner, so that a window's mean step is four look-ups.
@@ -72,11 +76,11 @@ class Textures:
         taken = lively.float().argmax(1)[:, None]
         which, y, x = (drawn.gather(1, taken)[:, 0] for drawn in (which, y, x))
         mirrored = torch.rand(batch) < 0.5
-        if self.squares.is_cuda:
+        if self.words is not None:
             along = torch.arange(side)
             columns = torch.where(mirrored[:, None], x[:, None] + side - 1 - along, x[:, None] + along)
             index = (which[:, None, None] * SIDE + (y[:, None] + along)[:, :, None]) * SIDE + columns[:, None]
-            windows = self.squares.view(-1, 3)[index]
+            windows = self.words[index][..., None].view(torch.uint8)[..., :3]
         else:
             places = zip(which.tolist(), y.tolist(), x.tolist(), mirrored.tolist())
             cut = [(self.squares[n, j : j + side, i : i + side], flip) for n, j, i, flip in places]
@@ -198,8 +202,12 @@ class Outline:
         return (torch.where(b(self.barred), cover * bars, cover) * b(self.present))[:, None]
 
 
-def scene(textures: Textures, batch: int, height: int, width: int, mixture=MIXTURE, shapes: int = 5):
-    """Two frames [B, 3, H, W] in 0...1 and the flow [B, 2, H, W] from the first to the second, in pixels."""
+def scene(textures: Textures, batch: int, height: int, width: int, mixture=MIXTURE, shapes: int = SHAPES, apart=()):
+    """Two frames [B, 3, H, W] in 0...1 and the flow [B, 2, H, W] from the first to the second, in pixels.
+
+    A shape moves about as much as the camera does, but for those that move `apart`, by a displacement of their own out of that
+    mixture, whose shares need not add up to one: what is fast over a slow ground is what a pyramid loses first.
+    """
     side = min(SIDE, 64 * math.ceil(1.6 * max(height, width) / 64))
     size = 0.5 * math.hypot(height, width)
     x, y = torch.arange(width).float(), torch.arange(height).float()
@@ -214,7 +222,11 @@ def scene(textures: Textures, batch: int, height: int, width: int, mixture=MIXTU
     flow = mapped(camera, points) - points
     for _ in range(shapes):
         outline, surface = Outline(batch, height, width), Surface(textures.draw(batch, side), height, width)
-        own = homographies(magnitude * uniform(batch, 0.0, 1.2), outline.x, outline.y, 0.6 * size)
+        much = magnitude * uniform(batch, 0.0, 1.2)
+        if apart:
+            own = torch.rand(batch) < sum(share for share, _, _ in apart)
+            much = torch.where(own, magnitudes(batch, apart), much)
+        own = homographies(much, outline.x, outline.y, 0.6 * size)
         motion = camera @ own
         origin = mapped(inverse(motion), points)
         cover, cover_second = outline.cover(points), outline.cover(origin)
@@ -235,13 +247,14 @@ class Bank:
         self.frames, self.flow = frames, flow
 
     @classmethod
-    def made(cls, textures: Textures, count: int, height: int, width: int, mixture=MIXTURE):
-        """`count` scenes, eight at a time."""
+    def made(cls, textures: Textures, count: int, height: int, width: int, mixture=MIXTURE, **kind):
+        """`count` scenes, a few at a time; `kind` is what `scene` is told of its shapes."""
         frames = torch.empty(count, 2, 3, height, width, dtype=torch.uint8)
         flow = torch.empty(count, 2, height, width, dtype=torch.float16)
-        for i in range(0, count, 8):
-            first, second, flow[i : i + 8] = scene(textures, min(8, count - i), height, width, mixture)
-            frames[i : i + 8] = torch.stack([first, second], 1).mul(255).add(0.5)
+        some = 96 if frames.is_cuda else 8
+        for i in range(0, count, some):
+            first, second, flow[i : i + some] = scene(textures, min(some, count - i), height, width, mixture, **kind)
+            frames[i : i + some] = torch.stack([first, second], 1).mul(255).add(0.5)
         return cls(frames, flow)
 
     @classmethod
@@ -261,22 +274,34 @@ class Bank:
             raise ValueError(f"{file}: expected a bank of {known}, found one of {held['described']}")
         return cls(held["frames"], held["flow"])
 
+    def gathered(self, which: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor):
+        """The same by one index for all, of rows [B, H] and columns [B, W]."""
+        at = which[:, None, None], rows[:, :, None], columns[:, None]
+        frames, flow = self.frames[at[0], :, :, at[1], at[2]], self.flow[at[0], :, at[1], at[2]]
+        return frames.permute(0, 3, 4, 1, 2), flow.permute(0, 3, 1, 2)
+
+    def windows(self, which: torch.Tensor, down: torch.Tensor, right: torch.Tensor, height: int, width: int):
+        """Frames [B, 2, 3, H, W] in 0...255 and flow [B, 2, H, W] at these places, on the default device."""
+        if self.flow.is_cuda:  # Places stay on the device: reading them would mean waiting for it.
+            return self.gathered(which, down[:, None] + torch.arange(height), right[:, None] + torch.arange(width))
+        places = zip(which.tolist(), down.tolist(), right.tolist())
+        places = [(n, ..., slice(y, y + height), slice(x, x + width)) for n, y, x in places]
+        device = torch.get_default_device()
+        return tuple(torch.stack([held[place] for place in places]).to(device) for held in (self.frames, self.flow))
+
     def draw(self, batch: int, height: int, width: int):
         """As `scene`: two frames [B, 3, H, W] in 0...1 and the flow [B, 2, H, W]."""
         rows, columns = self.flow.shape[2:]
-        which = torch.randint(len(self.flow), (batch,)).tolist()
-        down = torch.randint(rows - height + 1, (batch,)).tolist()
-        right = torch.randint(columns - width + 1, (batch,)).tolist()
-        places = [(n, ..., slice(y, y + height), slice(x, x + width)) for n, y, x in zip(which, down, right)]
-        device = torch.get_default_device()
-        frames = torch.stack([self.frames[place] for place in places]).to(device).float().div_(255)
-        flow = torch.stack([self.flow[place] for place in places]).to(device).float()
+        which = torch.randint(len(self.flow), (batch,))
+        down = torch.randint(rows - height + 1, (batch,))
+        right = torch.randint(columns - width + 1, (batch,))
+        frames, flow = self.windows(which, down, right, height, width)
+        frames, flow = frames.float().div_(255), flow.float()
         # Along x, then along y; what is mirrored moves the other way.
-        for component, side in ((0, -1), (1, -2)):
-            mirrored = torch.rand(batch) < 0.5
-            frames[mirrored] = frames[mirrored].flip(side)
-            flow[mirrored] = flow[mirrored].flip(side)
-            flow[mirrored, component] *= -1
+        for turned, side in (((-1.0, 1.0), -1), ((1.0, -1.0), -2)):
+            mirrored = (torch.rand(batch) < 0.5)[:, None, None, None]
+            frames = torch.where(mirrored[..., None], frames.flip(side), frames)
+            flow = torch.where(mirrored, flow.flip(side) * torch.tensor(turned)[:, None, None], flow)
         return frames[:, 0], frames[:, 1], flow
 
 

@@ -158,7 +158,9 @@ class Run:
         self.optimizer.zero_grad(set_to_none=True)
         (loss + 0.1 * likelihood).backward()
         average_gradients(self.network)
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.description["clip"])
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.description["clip"])
+        # A step whose gradient is not finite is left out by the fused optimizer itself, without waiting for the device.
+        self.optimizer.found_inf = (~norm.isfinite()).float()
         self.optimizer.step()
         self.step += 1
         decay = min(self.description["mean_decay"], self.step / (self.step + 10))
@@ -238,36 +240,47 @@ def waited(device: torch.device) -> float:
 
 def leg(run: Run, folder: Path, packed: Path, minutes: float, every: float) -> None:
     """Trains for so many minutes; a log row and a checkpoint every `every` minutes and at the end."""
+    called = time.monotonic()
     textures, first = Textures(packed, held_out=False), not dist.is_initialized() or dist.get_rank() == 0
     log = Log(folder / "log.csv", packed) if first else None
     if not first:  # Workers start from one checkpoint and must not draw the same scenes.
         torch.manual_seed(1000 * run.step + dist.get_rank())
     mixture = run.description.get("displacements", MIXTURE)
+    kind = {key: run.description[key] for key in ("shapes", "apart") if key in run.description}
     if "bank" in run.description:
-        bank = dict(run.description["bank"])
-        textures = Bank.kept(Path(bank.pop("file")), textures, run.description["seed"], mixture=mixture, **bank)
+        bank = {"mixture": mixture} | run.description["bank"] | kind
+        file = bank.pop("file", None)
+        textures = Bank.kept(Path(file), textures, run.description["seed"], **bank) if file else Bank.made(textures, **bank)
     before, began, row_due, losses, over = run.seconds, time.monotonic(), run.seconds + 60 * every, [], False
     told, counted = began + 30, 0
     if first and run.step == 0:
         log.row(run, losses)
+    made_for, ahead, made_at_once = None, [], run.description.get("ahead", 1)
     while not over:
         crop = run.crop()
         # One step in fifty is timed part by part; the others are not waited for.
         timed = first and run.step % 50 == 20
         start = waited(run.device) if timed else 0.0
         size, batch = (crop["height"], crop["width"]), crop["batch"]
-        pairs = batch_of(textures, *size, run.noise(batch), mixture, batch, run.recipe)
+        if timed or not ahead or made_for != crop:
+            many = batch * made_at_once
+            made_of = batch_of(textures, *size, run.noise(many), mixture, many, run.recipe, **kind)
+            made_for, ahead = crop, list(zip(*(part.split(batch) for part in made_of)))
         made = waited(run.device) if timed else 0.0
-        losses.append(run.train_step(*pairs))
+        losses.append(run.train_step(*ahead.pop()))
+        if counted == 0:  # The schedule is one of training: what is compiled by the first step does not count.
+            waited(run.device)
+            began, told = time.monotonic(), time.monotonic() + 30
         counted += batch
         if timed:
             end = waited(run.device)
-            share, now = (made - start) / (end - start), time.monotonic()
+            making, now = (made - start) / made_at_once, time.monotonic()
+            share = making / (making + end - made)
             if now >= told:
                 told = now + 60
                 print(f"# {counted / (now - began):.1f} pairs/s; {100 * share:.0f} % of a step is spent making pairs", flush=True)
         seconds = before + time.monotonic() - began
-        over, run.seconds = agreed(seconds - before >= 60 * minutes, seconds)
+        over, run.seconds = agreed(time.monotonic() - called >= 60 * minutes, seconds)
         over = over or run.progress() >= 1
         if first and (over or run.seconds >= row_due):
             log.row(run, losses)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from networks import LOOKS, SHIFT, PwcNet, cost_volume, cost_volume_plain, halved, twice
+from networks import LOOKS, SHIFT, PwcNet, columns, cost_volume, cost_volume_plain, halved, twice
 
 
 @pytest.mark.parametrize(
@@ -20,6 +20,11 @@ def test_fast_cost_volume_equals_the_plain_one(shape, tile, reach):
     got = torch.autograd.grad((fast * weight).sum(), (older, newer))
     for g, w in zip(got, wanted):
         torch.testing.assert_close(g, w, rtol=0, atol=1e-12)
+
+
+def test_a_gpu_takes_whole_rows():
+    assert [columns(level, torch.device("cpu")) for level in (2, 3, 4)] == [16, 8, None]
+    assert [columns(level, torch.device("cuda")) for level in (2, 3, 4)] == [None, None, None]
 
 
 def test_cost_volume_peaks_at_the_displacement():

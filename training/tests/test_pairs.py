@@ -108,6 +108,30 @@ def test_held_out_photographs_are_never_trained_on(packed):
     assert not any((u == s).all() for u in unseen for s in seen)
 
 
+def test_what_a_gpu_fetches_is_what_a_cpu_fetches(packed):
+    textures = Textures(packed, held_out=False)
+    torch.manual_seed(3)
+    cut = textures.draw(5, 64)
+    textures.words = torch.nn.functional.pad(textures.squares, (0, 1)).view(torch.int32).flatten()
+    torch.manual_seed(3)
+    assert torch.equal(textures.draw(5, 64), cut)
+    bank = Bank.made(textures, 4, 64, 128)
+    which, down, right = torch.tensor([2, 0, 2]), torch.tensor([0, 5, 16]), torch.tensor([64, 0, 7])
+    gathered = bank.gathered(which, down[:, None] + torch.arange(48), right[:, None] + torch.arange(64))
+    for one, other in zip(gathered, bank.windows(which, down, right, 48, 64)):
+        assert one.shape == other.shape and torch.equal(one, other)
+
+
+def test_shapes_that_move_apart_are_fast_over_a_still_ground(packed):
+    textures, still = Textures(packed, held_out=False), ((1.0, 0.0, 0.0),)
+    torch.manual_seed(3)
+    _, _, together = scenes.scene(textures, 4, 64, 64, still, shapes=3)
+    assert together.abs().max() < 1e-3
+    first, second, apart = scenes.scene(textures, 8, 64, 64, still, shapes=3, apart=((0.5, 8.0, 16.0), (0.5, 0.0, 1.0)))
+    speed = apart.norm(dim=1)
+    assert (speed > 2).float().mean() > 0.05 and (speed < 1e-3).float().mean() > 0.3
+
+
 def test_held_out_pairs_are_the_same_every_time(packed):
     before = torch.get_rng_state()
     one, two = (HeldOut(packed, count=3, height=64, width=64) for _ in range(2))

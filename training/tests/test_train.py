@@ -102,7 +102,7 @@ def test_every_description_makes_a_run(description):
     known = tomllib.loads(description.read_text())
     leg = {"start"} if description.stem.endswith("_leg") else set()
     own = {"pwcnet": {"start"}, "raftsmall": {"iterations", "start"}}.get(known["network"], {"width"} | leg)
-    extra = {"darkest", "towards_bright", "displacements", "recipe", "bank"}
+    extra = {"darkest", "towards_bright", "displacements", "recipe", "bank", "shapes", "apart", "ahead"}
     assert set(known) - extra == set(DESCRIPTION) | own, "the same keys as every run"
     known.pop("start", None)
     run = Run(known)
@@ -126,6 +126,30 @@ def test_a_leg_writes_its_log_and_a_checkpoint(packed, tmp_path):
     again = Run(DESCRIPTION)
     again.load(tmp_path / "checkpoint")
     assert again.step == 2
+
+
+def test_a_leg_may_make_several_batches_ahead_and_keep_a_bank_to_itself(packed, tmp_path):
+    bank = {"count": 4, "height": 64, "width": 128}
+    run = Run(DESCRIPTION | {"schedule": {"steps": 5}, "ahead": 3, "bank": bank, "shapes": 2, "apart": [[0.5, 8.0, 16.0]]})
+    given, step = [], run.train_step
+    run.train_step = lambda *pairs: given.append(pairs) or step(*pairs)
+    leg(run, tmp_path, packed, minutes=10, every=10)
+    assert [tuple(older.shape) for older, _, _ in given] == 3 * [(2, 3, 64, 64)] + 2 * [(1, 3, 64, 128)]
+    assert not torch.equal(given[0][0], given[1][0]) and run.step == 5
+
+
+def test_a_step_whose_gradient_is_not_finite_is_left_out(packed):
+    run = Run(DESCRIPTION)
+    pairs = batch_of(Textures(packed, held_out=False), 64, 64, run.noise(2))
+    run.train_step(*pairs)
+    before = {name: value.clone() for name, value in run.network.state_dict().items()}
+    torn = pairs[2].clone()
+    torn[0, 0, 0, 0] = torch.nan
+    run.train_step(*pairs[:2], torn)
+    assert all(torch.equal(value, before[name]) for name, value in run.network.state_dict().items())
+    run.train_step(*pairs)
+    after = run.network.state_dict()
+    assert all(value.isfinite().all() for value in after.values()) and any(not torch.equal(after[n], v) for n, v in before.items())
 
 
 def test_a_leg_from_a_checkpoint_by_another_recipe_out_of_a_bank(packed, tmp_path, monkeypatch, one_thread):
