@@ -68,7 +68,7 @@ def loss_of(network, flows, expected, truth):
 def average_gradients(network: nn.Module) -> None:
     """Under `torchrun`, the mean gradient of all workers, in one exchange a step."""
     if dist.is_initialized():
-        gradients = [p.grad for p in network.parameters()]
+        gradients = [p.grad for p in network.parameters() if p.requires_grad]
         flat = torch.cat([g.flatten() for g in gradients])
         dist.all_reduce(flat)
         flat /= dist.get_world_size()
@@ -108,6 +108,9 @@ class Run:
         fast, slow, rest = [], [], []
         for name, parameter in self.network.named_parameters():
             of = lambda parts: any(part in name for part in parts)
+            if not of(description.get("only", [""])):
+                parameter.requires_grad_(False)
+                continue
             (fast if of(network.FAST) else slow if of(network.SLOW) else rest).append(parameter)
         self.optimizer = torch.optim.AdamW(
             [

@@ -10,10 +10,11 @@ use super::{
 };
 
 /// What the last part of a network's name says that it was trained on.
-pub const TRAINED: [(&str, &str); 5] = [
+pub const TRAINED: [(&str, &str); 6] = [
     ("clean", "clean"),
     ("fcdn", "FCDN, paper"),
-    // Not from the start, but as the two below it: a few steps more of a network that was trained clean.
+    // What the three below it start from, each by a few steps more.
+    ("start", "clean, short"),
     ("paper", "FCDN, paper, short"),
     ("authors2021", "FCDN, authors 2021"),
     ("unprocess", "unprocess"),

@@ -102,7 +102,7 @@ def test_every_description_makes_a_run(description):
     known = tomllib.loads(description.read_text())
     leg = {"start"} if description.stem.endswith("_leg") else set()
     own = {"pwcnet": {"start"}, "raftsmall": {"iterations", "start"}}.get(known["network"], {"width"} | leg)
-    extra = {"darkest", "towards_bright", "displacements", "recipe", "bank", "shapes", "apart", "ahead"}
+    extra = {"darkest", "towards_bright", "displacements", "recipe", "bank", "shapes", "apart", "ahead", "only"}
     assert set(known) - extra == set(DESCRIPTION) | own, "the same keys as every run"
     known.pop("start", None)
     run = Run(known)
@@ -136,6 +136,15 @@ def test_a_leg_may_make_several_batches_ahead_and_keep_a_bank_to_itself(packed, 
     leg(run, tmp_path, packed, minutes=10, every=10)
     assert [tuple(older.shape) for older, _, _ in given] == 3 * [(2, 3, 64, 64)] + 2 * [(1, 3, 64, 128)]
     assert not torch.equal(given[0][0], given[1][0]) and run.step == 5
+
+
+def test_a_run_may_train_the_error_heads_alone(packed, tmp_path):
+    run = Run(DESCRIPTION | {"only": ["decoder.error."], "schedule": {"steps": 2}})
+    before = {name: value.clone() for name, value in run.network.state_dict().items()}
+    leg(run, tmp_path, packed, minutes=10, every=10)
+    for kept in (run.network.state_dict(), checkpoints.load(tmp_path / "checkpoint")["mean"]):
+        moved = {name for name, value in kept.items() if not torch.equal(value, before[name])}
+        assert moved == {name for name in before if name.startswith("decoder.error.")}
 
 
 def test_a_step_whose_gradient_is_not_finite_is_left_out(packed):
