@@ -66,8 +66,19 @@ pub struct Fetch<'a> {
     pub to: Band<'a, f32>,
 }
 
-/// The four cells around a point: where their channels begin, and what they weigh.
-type Corners = ([usize; 4], [f32; 4]);
+/// Where a flow leads from a cell, of so many in a row or column.
+///
+/// By way of the plain graph's grid of −1…1, since there the last digits are rounded off: where nothing matches anything
+/// a network makes tenths of a thousandth of a pixel of them, and both graphs are to give the same flow.
+#[inline(always)]
+fn place(cell: usize, flow: f32, cells: usize) -> f32 {
+    let cells = cells as f32;
+    let grid = (cell as f32 + flow + 0.5) * (2.0 / cells) - 1.0;
+    ((grid + 1.0) * cells - 1.0) / 2.0
+}
+
+/// The four cells around a point: where their channels begin, what they weigh in their row, and what the two rows weigh.
+type Corners = ([usize; 4], [f32; 4], [f32; 2]);
 
 impl Fetch<'_> {
     /// A cell that lies outside weighs nothing, and so does a point that is no number.
@@ -76,16 +87,17 @@ impl Fetch<'_> {
         let Shape { height, width, .. } = *self.shape;
         let (cells, depth) = (self.shape.cells(), self.shape.depth());
         let at = y * width + x;
-        let (x, y) = (x as f32 + self.flow[at], y as f32 + self.flow[cells + at]);
-        let (mut from, mut weights) = ([0; 4], [0.0; 4]);
+        let (x, y) = (place(x, self.flow[at], width), place(y, self.flow[cells + at], height));
+        let (mut from, mut weights, mut rows) = ([0; 4], [0.0; 4], [0.0; 2]);
         if x > -1.0 && y > -1.0 && x < width as f32 && y < height as f32 {
             let (left, top) = (x.floor(), y.floor());
             let (right, below) = (x - left, y - top);
+            rows = [top + 1.0 - y, below];
             for (corner, (column, row, weight)) in [
-                (left, top, (1.0 - right) * (1.0 - below)),
-                (left + 1.0, top, right * (1.0 - below)),
-                (left, top + 1.0, (1.0 - right) * below),
-                (left + 1.0, top + 1.0, right * below),
+                (left, top, left + 1.0 - x),
+                (left + 1.0, top, right),
+                (left, top + 1.0, left + 1.0 - x),
+                (left + 1.0, top + 1.0, right),
             ]
             .into_iter()
             .enumerate()
@@ -96,7 +108,7 @@ impl Fetch<'_> {
                 }
             }
         }
-        (from, weights)
+        (from, weights, rows)
     }
 }
 
@@ -110,21 +122,25 @@ impl Work for Fetch<'_> {
         for y in self.to.first..self.to.end {
             for x in (0..width).step_by(TILE) {
                 let some = TILE.min(width - x);
-                let mut corners: [Corners; TILE] = [([0; 4], [0.0; 4]); TILE];
+                let mut corners: [Corners; TILE] = [([0; 4], [0.0; 4], [0.0; 2]); TILE];
                 for (i, corners) in corners[..some].iter_mut().enumerate() {
                     *corners = self.corners(x + i, y);
                 }
                 let to = self.to.row(0, y);
                 for c in (0..channels).step_by(block) {
                     let mut tiles = [0.0; lanes::MOST * TILE];
-                    for (pixel, (from, weights)) in corners.iter().enumerate() {
+                    for (pixel, (from, weights, rows)) in corners.iter().enumerate() {
                         for part in (0..block).step_by(L::COUNT) {
-                            let mut sum = lanes.splat(0.0);
-                            for (from, weight) in from.iter().zip(weights) {
-                                sum =
-                                    lanes.fused(lanes.load(&self.newer[from + c + part..]), lanes.splat(*weight), sum);
-                            }
-                            lanes.store(sum, &mut tiles[pixel * block + part..]);
+                            // Rounded after each product, in the order of the plain graph's operator.
+                            let part_of = |corner: usize| {
+                                let seen = lanes.load(&self.newer[from[corner] + c + part..]);
+                                lanes.mul(seen, lanes.splat(weights[corner]))
+                            };
+                            let row = |row: usize| {
+                                let both = lanes.add(part_of(2 * row), part_of(2 * row + 1));
+                                lanes.mul(both, lanes.splat(rows[row]))
+                            };
+                            lanes.store(lanes.add(row(0), row(1)), &mut tiles[pixel * block + part..]);
                         }
                     }
                     for (tile, c) in (0..block).step_by(TILE).zip((c..channels).step_by(TILE)) {
@@ -308,7 +324,7 @@ impl Seek<'_> {
         let Shape { height, width, .. } = *self.shape;
         let columns = self.shape.columns();
         let (first, end) = (y.saturating_sub(1), (y + 2).min(height));
-        let per_row = self.scale / (end - first) as f32;
+        let rows = (end - first) as f32;
         let (pooled, sums) = self.scratch.split_at_mut(self.shape.displacements() * columns);
         // Of columns −1 to `columns`; what is not in the image stays zero.
         let sums = &mut sums[..columns + 2];
@@ -320,15 +336,16 @@ impl Seek<'_> {
             for row in plane[(first + 1) * width..end * width].chunks_exact(width) {
                 within.iter_mut().zip(row).for_each(|(sum, value)| *sum += value);
             }
-            let third = lanes.splat(per_row / 3.0);
+            // A division, as in the plain graph's operator: see [`place`].
+            let (cells, scale) = (lanes.splat(3.0 * rows), lanes.splat(self.scale));
             for (x, pooled) in pooled.chunks_exact_mut(L::COUNT).enumerate() {
                 let sums = &sums[x * L::COUNT..][..L::COUNT + 2];
                 let sum = lanes.add(lanes.add(lanes.load(sums), lanes.load(&sums[1..])), lanes.load(&sums[2..]));
-                lanes.store(lanes.mul(sum, third), pooled);
+                lanes.store(lanes.mul(lanes.div(sum, cells), scale), pooled);
             }
-            let edge = if width == 1 { per_row } else { per_row / 2.0 };
-            pooled[0] = (sums[1] + sums[2]) * edge;
-            pooled[width - 1] = (sums[width - 1] + sums[width]) * edge;
+            let edge = if width == 1 { rows } else { 2.0 * rows };
+            pooled[0] = (sums[1] + sums[2]) / edge * self.scale;
+            pooled[width - 1] = (sums[width - 1] + sums[width]) / edge * self.scale;
         }
     }
 
