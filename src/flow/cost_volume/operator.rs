@@ -23,12 +23,38 @@ pub struct Fused;
 pub struct Node {
     reach: usize,
     gain: f32,
+    /// The flow as the plain graph sees it.
+    rounded: Vec<f32>,
     work: CostVolume,
 }
 
 impl From<Unfit> for Error {
     fn from(unfit: Unfit) -> Self {
         Error::new(unfit.to_string())
+    }
+}
+
+/// A flow from a cell of so many in a row or column, with the digits that a grid of −1…1 leaves it.
+///
+/// The plain graph's `GridSample` takes such a grid. Where nothing matches anything a network makes tenths of a thousandth
+/// of a pixel of those digits, and both graphs are to give the same flow.
+fn through_grid(flow: f32, cell: usize, cells: usize) -> f32 {
+    let (cell, cells) = (cell as f32, cells as f32);
+    let grid = (cell + flow + 0.5) * (2.0 / cells) - 1.0;
+    ((grid + 1.0) * cells - 1.0) / 2.0 - cell
+}
+
+/// [`through_grid`] for 2 planes of rows of `width`, right and down.
+fn round(flow: &[f32], width: usize, rounded: &mut Vec<f32>) {
+    let cells = flow.len() / 2;
+    let height = cells / width;
+    rounded.resize(flow.len(), 0.0);
+    let (right, down) = rounded.split_at_mut(cells);
+    for (to, from) in right.chunks_exact_mut(width).zip(flow.chunks_exact(width)) {
+        to.iter_mut().zip(from).enumerate().for_each(|(x, (to, u))| *to = through_grid(*u, x, width));
+    }
+    for (y, (to, from)) in down.chunks_exact_mut(width).zip(flow[cells..].chunks_exact(width)).enumerate() {
+        to.iter_mut().zip(from).for_each(|(to, v)| *to = through_grid(*v, y, height));
     }
 }
 
@@ -61,7 +87,7 @@ impl Operator for Fused {
         if !gain.is_normal() {
             return Err(Error::new(format!("CostVolume: gain should be finite and not zero, it is {gain}")));
         }
-        Ok(Node { reach: reach(attributes.get("reach"))?, gain, work: CostVolume::default() })
+        Ok(Node { reach: reach(attributes.get("reach"))?, gain, rounded: vec![], work: CostVolume::default() })
     }
 }
 
@@ -80,7 +106,8 @@ impl Kernel for Node {
             return Err(Error::new(format!("CostVolume: newer, flow and sharpness don't fit {lengths:?}: {found}")));
         }
         let shape = Shape { channels, height, width, reach: self.reach };
-        let inputs = Inputs { older, newer, flow, sharpness: sharpness[0], gain: self.gain };
+        round(flow, width.max(1), &mut self.rounded);
+        let inputs = Inputs { older, newer, flow: &self.rounded, sharpness: sharpness[0], gain: self.gain };
         let volume = output(context, 0, [1, shape.displacements() as i64, lengths[2], lengths[3]])?;
         let argmax = output(context, 1, [1, 2, lengths[2], lengths[3]])?;
         let products = shape.cells().saturating_mul(channels).saturating_mul(shape.displacements());

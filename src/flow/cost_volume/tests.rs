@@ -139,6 +139,14 @@ fn the_networks_own_sizes_are_what_the_definition_says() {
     }
 }
 
+/// With one channel there is no mean that would hide a last digit that a point lost.
+#[test]
+fn a_single_channel_is_fetched_with_all_its_digits() {
+    for (width, far, seed) in [(24, 4.983_982_6, 138), (39, 12.0, 1), (320, 4.0, 2)] {
+        Case::new(shape(1, 5, width, 0), far, seed).holds();
+    }
+}
+
 #[test]
 fn flow_beyond_reason_fetches_zero_and_reads_nothing_from_outside() {
     let size = shape(9, 6, 19, 4);
@@ -202,7 +210,7 @@ fn what_does_not_fit_is_refused_and_an_error_ends_the_work() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(48))]
+    #![proptest_config(ProptestConfig::with_cases(1000))]
 
     #[test]
     fn any_size_is_what_the_definition_says(

@@ -66,17 +66,6 @@ pub struct Fetch<'a> {
     pub to: Band<'a, f32>,
 }
 
-/// Where a flow leads from a cell, of so many in a row or column.
-///
-/// By way of the plain graph's grid of −1…1, since there the last digits are rounded off: where nothing matches anything
-/// a network makes tenths of a thousandth of a pixel of them, and both graphs are to give the same flow.
-#[inline(always)]
-fn place(cell: usize, flow: f32, cells: usize) -> f32 {
-    let cells = cells as f32;
-    let grid = (cell as f32 + flow + 0.5) * (2.0 / cells) - 1.0;
-    ((grid + 1.0) * cells - 1.0) / 2.0
-}
-
 /// The four cells around a point: where their channels begin, what they weigh in their row, and what the two rows weigh.
 type Corners = ([usize; 4], [f32; 4], [f32; 2]);
 
@@ -87,16 +76,17 @@ impl Fetch<'_> {
         let Shape { height, width, .. } = *self.shape;
         let (cells, depth) = (self.shape.cells(), self.shape.depth());
         let at = y * width + x;
-        let (x, y) = (place(x, self.flow[at], width), place(y, self.flow[cells + at], height));
+        let (u, v) = (self.flow[at], self.flow[cells + at]);
+        // Whole cells first, so that no digit of the rest is lost on the way.
+        let (left, top) = (x as f32 + u.floor(), y as f32 + v.floor());
+        let (right, below) = (u - u.floor(), v - v.floor());
         let (mut from, mut weights, mut rows) = ([0; 4], [0.0; 4], [0.0; 2]);
-        if x > -1.0 && y > -1.0 && x < width as f32 && y < height as f32 {
-            let (left, top) = (x.floor(), y.floor());
-            let (right, below) = (x - left, y - top);
-            rows = [top + 1.0 - y, below];
+        if left >= -1.0 && top >= -1.0 && left < width as f32 && top < height as f32 {
+            rows = [1.0 - below, below];
             for (corner, (column, row, weight)) in [
-                (left, top, left + 1.0 - x),
+                (left, top, 1.0 - right),
                 (left + 1.0, top, right),
-                (left, top + 1.0, left + 1.0 - x),
+                (left, top + 1.0, 1.0 - right),
                 (left + 1.0, top + 1.0, right),
             ]
             .into_iter()
@@ -336,7 +326,7 @@ impl Seek<'_> {
             for row in plane[(first + 1) * width..end * width].chunks_exact(width) {
                 within.iter_mut().zip(row).for_each(|(sum, value)| *sum += value);
             }
-            // A division, as in the plain graph's operator: see [`place`].
+            // A division, as in the plain graph's operator: where nothing matches anything a network makes much of last digits.
             let (cells, scale) = (lanes.splat(3.0 * rows), lanes.splat(self.scale));
             for (x, pooled) in pooled.chunks_exact_mut(L::COUNT).enumerate() {
                 let sums = &sums[x * L::COUNT..][..L::COUNT + 2];
