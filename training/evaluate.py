@@ -111,6 +111,10 @@ def reliability_table(scores: dict[int, Scores]) -> list[str]:
     return [*lines, ""]
 
 
+# What a learning curve may be drawn against: the log's column, its name, and how far marks are apart.
+AXES = {"minutes": ("minutes", 10), "step": ("steps", 2000)}
+
+
 def curve_picture(log: Path, target: Path, against: str = "minutes") -> None:
     """The learning curve as an SVG: error by noise level against minutes or, where legs ran on unlike machines, against steps."""
     with open(log) as file:
@@ -132,10 +136,11 @@ def curve_picture(log: Path, target: Path, against: str = "minutes") -> None:
         (x0, y), (x1, _) = place(0, error), place(longest, error)
         parts.append(f'<path d="M{x0:.1f} {y:.1f}H{x1:.1f}" stroke="#ddd"/>')
         parts.append(f'<text x="{x0 - 24}" y="{y + 4:.1f}">{error}</text>')
-    for mark in range(0, int(longest) + 1, 10 if against == "minutes" else 2000):
+    unit, apart = AXES[against]
+    for mark in range(0, int(longest) + 1, apart):
         x, y = place(mark, 0)
         parts.append(f'<text x="{x - 6:.1f}" y="{y + 16:.1f}">{mark}</text>')
-    parts.append(f'<text x="{left + 130}" y="{height - 8}">{"minutes" if against == "minutes" else "steps"} of training</text>')
+    parts.append(f'<text x="{left + 130}" y="{height - 8}">{unit} of training</text>')
     parts.append('<text x="4" y="12">px</text>')
     colours = ("#1b7837", "#2166ac", "#b2182b", "#000000", "#e08214")
     for i, (key, colour) in enumerate(zip(names, colours)):
@@ -154,7 +159,7 @@ def main() -> None:
     parser.add_argument("--photographs", type=Path, default=Path("runs/photographs.npz"))
     parser.add_argument("--public", type=Path, help="folder of public pairs with ground truth (judging only)")
     parser.add_argument("--log", type=Path, default=Path("runs/fcdn/log.csv"))
-    parser.add_argument("--against", choices=("minutes", "step"), default="minutes", help="what the learning curve is drawn against")
+    parser.add_argument("--against", choices=AXES, default="minutes", help="what the learning curve is drawn against")
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()

@@ -144,16 +144,16 @@ class HeldOut:
             with torch.device("cpu"):
                 textures = Textures(packed, held_out=True)
                 parts = [batch_of(textures, height, width, None) for _ in range(-(-count // 4))]
-        self.drawn = [torch.cat(p)[:count] for p in zip(*parts)]
-        self.first, self.second, self.flow = (part.to(torch.get_default_device()) for part in self.drawn)
+        self.first, self.second, flow = (torch.cat(p)[:count] for p in zip(*parts))
+        self.flow = flow.to(torch.get_default_device())
 
     def at(self, level: float, seed: int = 11):
         """Older and newer frames at a noise level of 0...30."""
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             with torch.device("cpu"):
-                pair = noisy(*self.drawn[:2], level)
-            return tuple(frame.to(self.first.device) for frame in pair)
+                pair = noisy(self.first, self.second, level)
+            return tuple(frame.to(self.flow.device) for frame in pair)
 
 
 def read_flo(path: Path) -> np.ndarray:

@@ -274,12 +274,6 @@ class Bank:
             raise ValueError(f"{file}: expected a bank of {known}, found one of {held['described']}")
         return cls(held["frames"], held["flow"])
 
-    def gathered(self, which: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor):
-        """The same by one index for all, of rows [B, H] and columns [B, W]."""
-        at = which[:, None, None], rows[:, :, None], columns[:, None]
-        frames, flow = self.frames[at[0], :, :, at[1], at[2]], self.flow[at[0], :, at[1], at[2]]
-        return frames.permute(0, 3, 4, 1, 2), flow.permute(0, 3, 1, 2)
-
     def windows(self, which: torch.Tensor, down: torch.Tensor, right: torch.Tensor, height: int, width: int):
         """Frames [B, 2, 3, H, W] in 0...255 and flow [B, 2, H, W] at these places, on the default device."""
         if self.flow.is_cuda:  # Places stay on the device: reading them would mean waiting for it.
@@ -288,6 +282,11 @@ class Bank:
         places = [(n, ..., slice(y, y + height), slice(x, x + width)) for n, y, x in places]
         device = torch.get_default_device()
         return tuple(torch.stack([held[place] for place in places]).to(device) for held in (self.frames, self.flow))
+
+    def gathered(self, which: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor):
+        """Windows of rows [B, H] and columns [B, W] by one index, that is by one kernel."""
+        n, y, x = which[:, None, None], rows[:, :, None], columns[:, None]
+        return self.frames[n, :, :, y, x].permute(0, 3, 4, 1, 2), self.flow[n, :, y, x].permute(0, 3, 1, 2)
 
     def draw(self, batch: int, height: int, width: int):
         """As `scene`: two frames [B, 3, H, W] in 0...1 and the flow [B, 2, H, W]."""

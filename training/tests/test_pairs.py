@@ -127,7 +127,7 @@ def test_shapes_that_move_apart_are_fast_over_a_still_ground(packed):
     torch.manual_seed(3)
     _, _, together = scenes.scene(textures, 4, 64, 64, still, shapes=3)
     assert together.abs().max() < 1e-3
-    first, second, apart = scenes.scene(textures, 8, 64, 64, still, shapes=3, apart=((0.5, 8.0, 16.0), (0.5, 0.0, 1.0)))
+    _, _, apart = scenes.scene(textures, 8, 64, 64, still, shapes=3, apart=((0.5, 8.0, 16.0), (0.5, 0.0, 1.0)))
     speed = apart.norm(dim=1)
     assert (speed > 2).float().mean() > 0.05 and (speed < 1e-3).float().mean() > 0.3
 

@@ -48,8 +48,8 @@ pub struct Args {
 
 /// Networks of the paper by all that they were trained on.
 const DEFAULT: &str = "flownetc_clean,flownetc_fcdn,flownetc_authors2021,flownetc_unprocess,flownets_clean,flownets_fcdn,\
-    flownets_authors2021,flownets_unprocess,pwcnet_clean,pwcnet_fcdn,pwcnet_start,\
-    pwcnet_paper,pwcnet_authors2021,pwcnet_unprocess";
+    flownets_authors2021,flownets_unprocess,pwcnet_clean,pwcnet_fcdn,pwcnet_start,pwcnet_paper,\
+    pwcnet_authors2021,pwcnet_unprocess";
 
 /// What a set is called: its folder's own name.
 fn name_of(set: &Path) -> Result<String> {
