@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The trainer's tests with the very versions that pyproject.toml pins, set up under target/trainer the first time:
 #   training/check.sh [PYTEST ARGUMENTS]
-# One thread is the fastest on a busy machine: threads wait for each other at every operation.
+# As many tests at a time as there are cores, each on one thread: threads would wait for each other at every operation.
 set -euo pipefail
 cd "$(dirname "$0")"
 home=../target/trainer
@@ -16,4 +16,4 @@ if [ ! -f "$stamp" ]; then
   "$home/bin/python" -m pip install --quiet -e '.[test]'
   touch "$stamp"
 fi
-OMP_NUM_THREADS=${OMP_NUM_THREADS:-1} "$home/bin/python" -m pytest -q "$@"
+OMP_NUM_THREADS=${OMP_NUM_THREADS:-1} "$home/bin/python" -m pytest -q -n auto "$@"
