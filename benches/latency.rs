@@ -1,5 +1,5 @@
 //! From a camera's stamp to flow in another's hands, through zenoh, the network and shared memory:
-//! `cargo bench --bench latency [-- FRAMES [HZ]]`.
+//! `cargo bench --bench latency [-- FRAMES [HZ [PRECISION]]]`.
 //!
 //! The camera is a thread with a zenoh session of its own (TCP, as between two programs), the reader one with an iceoryx2
 //! node of its own; the node between them is the one that `nightflow run` runs. What is told is of every step that the
@@ -154,12 +154,17 @@ fn measure(settings: &str, size: [u32; 2], frames: usize, hz: f64) -> Outcome<Ru
     Ok(Run { ms, displaced, size })
 }
 
-fn report(frames: usize, hz: Option<f64>) -> Outcome<()> {
+fn report(frames: usize, hz: Option<f64>, precision: Option<&str>) -> Outcome<()> {
     // A rate that the network keeps with room to spare on two cores.
     let mut ways = vec![("fp32", "", 15.0)];
     if convolutions::Unit::best().is_fast() {
         ways.push(("bf16", "[flow]\nprecision = \"bf16\"", 30.0));
     }
+    let able: Vec<&str> = ways.iter().map(|way| way.0).collect();
+    if let Some(wanted) = precision.filter(|wanted| !able.contains(wanted)) {
+        return Err(format!("precision {wanted:?}: this machine has {}", able.join(" and ")).into());
+    }
+    ways.retain(|way| precision.is_none_or(|wanted| way.0 == wanted));
     println!("camera's stamp to received flow, {frames} frames each, milliseconds:\n");
     println!(
         "| precision, camera | steps | displaced | p50 | p99 | p99.9 | most | p99 / p50 |\n|{}",
@@ -188,7 +193,7 @@ fn main() -> ExitCode {
     // Under `cargo test --benches` it only shows that it still runs.
     let frames = given.next().and_then(|word| word.parse().ok()).unwrap_or(if bench { FRAMES } else { 8 });
     let hz = given.next().and_then(|word| word.parse().ok());
-    if let Err(reason) = report(frames, hz) {
+    if let Err(reason) = report(frames, hz, given.next().as_deref()) {
         eprintln!("latency was not measured: {reason}");
         return ExitCode::FAILURE;
     }

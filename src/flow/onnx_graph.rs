@@ -53,10 +53,16 @@ impl Graph {
     /// Runs the graph on images of 3 × `height` × `width` values, in the order of its inputs; gives the shape and the
     /// values of the first output.
     pub fn run(&mut self, images: &[&[f32]], width: usize, height: usize) -> Result<(Vec<usize>, Vec<f32>), Error> {
-        let tensor = |image| TensorRef::from_array_view(([1, 3, height, width], image));
-        let mut inputs = Vec::with_capacity(images.len());
-        for (name, &image) in self.inputs.iter().zip(images) {
-            inputs.push((name.clone(), tensor(image).map_err(failed("take an image"))?));
+        let inputs: Vec<_> = images.iter().map(|image| (*image, [1, 3, height, width])).collect();
+        self.run_on(&inputs)
+    }
+
+    /// The same on tensors of any lengths.
+    pub fn run_on(&mut self, tensors: &[(&[f32], [usize; 4])]) -> Result<(Vec<usize>, Vec<f32>), Error> {
+        let mut inputs = Vec::with_capacity(tensors.len());
+        for (name, &(values, lengths)) in self.inputs.iter().zip(tensors) {
+            let tensor = TensorRef::from_array_view((lengths, values));
+            inputs.push((name.clone(), tensor.map_err(failed("take a tensor"))?));
         }
         let outputs = self.session.run(inputs).map_err(failed("run the graph"))?;
         let (shape, values) = outputs[0].try_extract_tensor::<f32>().map_err(failed("give a result"))?;

@@ -2,8 +2,9 @@
 //!
 //! Everything that is compared runs in turns, so that other work on the machine strikes both alike; figures are medians.
 //! Decoders run through ONNX Runtime, as in the node. The cost volume alone, with its warp and soft arg-max, runs on one
-//! thread and is compared with its sliced form in Rust (a product and a mean for each displacement, as a graph of ONNX's
-//! operators does it; without warp and arg-max, so that it does less) and with a copy of as many bytes as go in and out.
+//! thread and is compared with the same in ONNX Runtime with a slice, a product and a mean for each displacement, with those
+//! products and means written out in Rust (without warp and arg-max, so that it does less), and with a copy of as many bytes
+//! as go in and out.
 
 use std::{
     collections::BTreeSet,
@@ -13,11 +14,13 @@ use std::{
     time::Instant,
 };
 
+mod sliced;
+
 use multiversion::multiversion;
 use nightflow::{
     exposure::Pair,
     flow::{
-        Config, Matcher, Operators, Own,
+        Config, Error, Matcher, Operators, Own,
         cost_volume::{CostVolume, Inputs, Outputs, Shape, Unfit},
         pattern,
     },
@@ -97,7 +100,7 @@ fn decoders(models: &Path, rounds: Rounds) -> Result<(), String> {
 
 /// The products and means of one displacement after the other, each over whole planes, as sliced graphs compute them.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2+fma", "aarch64+neon"))]
-fn sliced(shape: &Shape, older: &[f32], padded: &[f32], products: &mut [f32], volume: &mut [f32]) {
+fn written_out(shape: &Shape, older: &[f32], padded: &[f32], products: &mut [f32], volume: &mut [f32]) {
     let (Shape { channels, height, width, .. }, side) = (*shape, shape.side());
     let wide = width + side - 1;
     for (d, mean) in volume.chunks_exact_mut(height * width).enumerate() {
@@ -118,8 +121,8 @@ fn sliced(shape: &Shape, older: &[f32], padded: &[f32], products: &mut [f32], vo
     }
 }
 
-/// The cost volume of one level: fused, sliced, and a copy of as much memory as it reads and writes.
-fn volume(shape: Shape, rounds: Rounds) {
+/// The cost volume of one level: fused, sliced both ways, and a copy of as much memory as it reads and writes.
+fn volume(shape: Shape, rounds: Rounds) -> Result<(), Error> {
     let (Shape { channels, height, width, .. }, side) = (shape, shape.side());
     let cells = height * width;
     let noise = |k: usize, count: usize| -> Vec<f32> {
@@ -144,19 +147,32 @@ fn volume(shape: Shape, rounds: Rounds) {
         });
         done.expect("everything fits");
     };
-    let mut slices = || sliced(&shape, &older, &padded, &mut products, sliced_volume);
+    let mut graph = sliced::graph(shape)?;
+    let (grid, offsets) = (sliced::grid(&shape, &flow), noise(6, 2 * shape.displacements()));
+    let mut in_runtime = || {
+        let features = [1, channels, height, width];
+        let small = [(&grid[..], [1, height, width, 2]), (&offsets[..], [2, shape.displacements(), 1, 1])];
+        graph.run_on(&[(&older, features), (&newer, features), small[0], small[1]]).expect("the graph fits").1
+    };
+    let mut runtime = || drop(black_box(in_runtime()));
+    let mut slices = || written_out(&shape, &older, &padded, &mut products, sliced_volume);
     let mut copy = || black_box(&mut to).copy_from_slice(black_box(&from));
-    let [fused, slices, copy] = medians(rounds.volume, &mut [&mut fused, &mut slices, &mut copy]);
+    let [fused, runtime, slices, copy] =
+        medians(rounds.volume, &mut [&mut fused, &mut runtime, &mut slices, &mut copy]);
+    let apart = in_runtime().iter().zip(&*fused_volume).map(|(a, b)| (4.0 * a - b).abs()).fold(0.0, f32::max);
+    assert!(apart < 1e-3, "the runtime's volume is off by {apart}");
     let gigabytes = |ms: f64| 4.0 * moved as f64 / ms / 1e6;
     let operations = 2.0 * (channels * shape.displacements() * cells) as f64 / fused / 1e6;
     println!(
-        "{:<22}{fused:>7.2}{slices:>9.2}{:>14.1}{operations:>9.1}{:>7.2}{:>7.1}{:>12.2}",
+        "{:<22}{fused:>7.2}{runtime:>11.2}{:>8.1}{slices:>9.2}{:>8.1}{operations:>10.1}{:>7.2}{:>10.1}{:>12.2}",
         format!("{channels}x{height}x{width}, +-{}", shape.reach),
+        runtime / fused,
         slices / fused,
         gigabytes(fused),
         gigabytes(copy),
         copy / fused,
     );
+    Ok(())
 }
 
 fn main() -> ExitCode {
@@ -166,9 +182,14 @@ fn main() -> ExitCode {
     let rounds = if measured { Rounds { decoder: 15, volume: 60 } } else { Rounds { decoder: 1, volume: 1 } };
     let named = words.iter().position(|word| word == "models").and_then(|at| words.get(at + 1));
     let models = named.map_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/models")), PathBuf::from);
-    println!("cost volume, 1 thread  fused ms  sliced ms  sliced/fused  GFLOP/s   GB/s  a copy's  of a copy's");
+    println!(
+        "cost volume, 1 thread   fused, ms  sliced: runtime, /fused, Rust, /fused   GFLOP/s   GB/s  a copy's  of a copy's"
+    );
     for (channels, width, reach) in [(128, 40, 4), (32, 80, 2), (128, 80, 4), (32, 160, 2)] {
-        volume(Shape { channels, height: width * 4 / 5, width, reach }, rounds);
+        if let Err(error) = volume(Shape { channels, height: width * 4 / 5, width, reach }, rounds) {
+            eprintln!("the cost volumes were not measured: {error}");
+            return ExitCode::FAILURE;
+        }
     }
     if let Err(reason) = decoders(&models, rounds) {
         eprintln!("the decoders were not measured: {reason}");
