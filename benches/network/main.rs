@@ -14,8 +14,6 @@ use std::{
     time::Instant,
 };
 
-mod sliced;
-
 use multiversion::multiversion;
 use nightflow::{
     exposure::Pair,
@@ -25,6 +23,11 @@ use nightflow::{
         pattern,
     },
 };
+
+#[allow(dead_code)]
+#[path = "../../tests/it/onnx_bytes.rs"]
+mod onnx_bytes;
+mod sliced;
 
 const SIZES: [(usize, usize); 2] = [(320, 256), (640, 512)];
 const THREADS: [usize; 2] = [1, 2];

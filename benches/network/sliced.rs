@@ -2,118 +2,51 @@
 
 use nightflow::flow::{Config, Error, Graph, cost_volume::Shape};
 
-/// An attribute of a node; a list of whole numbers has another type than one.
-enum Value<'a> {
-    One(usize),
-    List(&'a [usize]),
-}
-use Value::{List, One};
-
-/// Appends a field of a message in protocol buffers, whose wire format ONNX files have.
-fn field(to: &mut Vec<u8>, number: u8, bytes: &[u8]) {
-    to.push(number << 3 | 2);
-    varint(to, bytes.len() as u64);
-    to.extend(bytes);
-}
-
-/// The same for a number.
-fn number(to: &mut Vec<u8>, field: u8, value: usize) {
-    varint(to, u64::from(field) << 3);
-    varint(to, value as u64);
-}
-
-fn varint(to: &mut Vec<u8>, mut value: u64) {
-    while value >= 0x80 {
-        to.push(value as u8 | 0x80);
-        value >>= 7;
-    }
-    to.push(value as u8);
-}
-
-/// Appends a node to a graph. Fields by their numbers in `onnx.proto`.
-fn node(graph: &mut Vec<u8>, operator: &str, inputs: &[&str], output: &str, attributes: &[(&str, Value<'_>)]) {
-    let mut node = vec![];
-    inputs.iter().for_each(|input| field(&mut node, 1, input.as_bytes()));
-    field(&mut node, 2, output.as_bytes());
-    field(&mut node, 4, operator.as_bytes());
-    for (name, value) in attributes {
-        let mut attribute = vec![];
-        field(&mut attribute, 1, name.as_bytes());
-        match value {
-            One(value) => number(&mut attribute, 3, *value),
-            List(values) => values.iter().for_each(|value| number(&mut attribute, 8, *value)),
-        }
-        number(&mut attribute, 20, if matches!(value, One(_)) { 2 } else { 7 });
-        field(&mut node, 5, &attribute);
-    }
-    field(graph, 1, &node);
-}
+use super::onnx_bytes::{attribute, inner, model, node, number, value};
 
 /// A list of whole numbers that nodes read.
-fn constant(graph: &mut Vec<u8>, name: &str, values: &[usize]) {
-    node(graph, "Constant", &[], name, &[("value_ints", List(values))]);
-}
-
-/// A tensor of floats that goes in (field 11) or out (12).
-fn outlet(graph: &mut Vec<u8>, direction: u8, name: &str, lengths: [usize; 4]) {
-    let (mut shape, mut tensor, mut kind, mut outlet) = (vec![], vec![], vec![], vec![]);
-    for length in lengths {
-        let mut dimension = vec![];
-        number(&mut dimension, 1, length);
-        field(&mut shape, 1, &dimension);
-    }
-    number(&mut tensor, 1, 1);
-    field(&mut tensor, 2, &shape);
-    field(&mut kind, 1, &tensor);
-    field(&mut outlet, 1, name.as_bytes());
-    field(&mut outlet, 2, &kind);
-    field(graph, direction, &outlet);
+fn constant(name: &str, values: [usize; 2]) -> Vec<u8> {
+    node("Constant", &[], name, &[attribute("value_ints", &values.map(|value| value as u64))])
 }
 
 /// The graph of one level for ONNX Runtime on one thread, with the inputs older and newer [1, C, H, W], grid [1, H, W, 2] of
-/// −1…1 and offsets [2, D, 1, 1], and the outputs volume and argmax. It leaves out the products
-/// with the gain and the sharpness.
+/// −1…1 and offsets [2, D, 1, 1], and the outputs volume and argmax. It leaves out the products with the gain and the sharpness.
 pub fn graph(shape: Shape) -> Result<Graph, Error> {
-    let Shape { channels, height, width, reach } = shape;
-    let displacements = shape.displacements();
-    let mut graph = vec![];
-    constant(&mut graph, "around", &[0, 0, reach, reach, 0, 0, reach, reach]);
-    constant(&mut graph, "axes", &[2, 3]);
-    node(&mut graph, "GridSample", &["newer", "grid"], "fetched", &[]);
-    node(&mut graph, "Pad", &["fetched", "around"], "padded", &[]);
+    let Shape { height, width, reach, .. } = shape;
+    let reach = reach as u64;
+    let channels = inner(5, &[inner(1, b"axis"), number(3, 1), number(20, 2)].concat());
+    let around = attribute("value_ints", &[0, 0, reach, reach, 0, 0, reach, reach]);
+    let mut parts = vec![
+        node("Constant", &[], "around", &[around]),
+        constant("axes", [2, 3]),
+        node("GridSample", &["newer", "grid"], "fetched", &[]),
+        node("Pad", &["fetched", "around"], "padded", &[]),
+    ];
     let mut means = vec![];
     for (dy, dx) in (0..shape.side()).flat_map(|dy| (0..shape.side()).map(move |dx| (dy, dx))) {
         let of = |what: &str| format!("{what}_{dy}_{dx}");
         let [start, end, slice, product, mean] = ["start", "end", "slice", "product", "mean"].map(of);
-        constant(&mut graph, &start, &[dy, dx]);
-        constant(&mut graph, &end, &[dy + height, dx + width]);
-        node(&mut graph, "Slice", &["padded", &start, &end, "axes"], &slice, &[]);
-        node(&mut graph, "Mul", &["older", &slice], &product, &[]);
-        node(&mut graph, "ReduceMean", &[&product], &mean, &[("axes", List(&[1]))]);
+        parts.extend([
+            constant(&start, [dy, dx]),
+            constant(&end, [dy + height, dx + width]),
+            node("Slice", &["padded", &start, &end, "axes"], &slice, &[]),
+            node("Mul", &["older", &slice], &product, &[]),
+            node("ReduceMean", &[&product], &mean, &[attribute("axes", &[1])]),
+        ]);
         means.push(mean);
     }
-    let names: Vec<&str> = means.iter().map(String::as_str).collect();
-    node(&mut graph, "Concat", &names, "volume", &[("axis", One(1))]);
-    let near = [("kernel_shape", List(&[3, 3])), ("pads", List(&[1, 1, 1, 1]))];
-    node(&mut graph, "AveragePool", &["volume"], "pooled", &near);
-    node(&mut graph, "Softmax", &["pooled"], "weights", &[("axis", One(1))]);
-    node(&mut graph, "Conv", &["weights", "offsets"], "argmax", &[]);
-    field(&mut graph, 2, b"sliced");
-    for name in ["older", "newer"] {
-        outlet(&mut graph, 11, name, [1, channels, height, width]);
-    }
-    outlet(&mut graph, 11, "grid", [1, height, width, 2]);
-    outlet(&mut graph, 11, "offsets", [2, displacements, 1, 1]);
-    outlet(&mut graph, 12, "volume", [1, displacements, height, width]);
-    outlet(&mut graph, 12, "argmax", [1, 2, height, width]);
-    let (mut opset, mut model) = (vec![], vec![]);
-    field(&mut opset, 1, b"");
-    number(&mut opset, 2, 17);
-    number(&mut model, 1, 8);
-    field(&mut model, 7, &graph);
-    field(&mut model, 8, &opset);
+    let means: Vec<&str> = means.iter().map(String::as_str).collect();
+    let near = [attribute("kernel_shape", &[3, 3]), attribute("pads", &[1, 1, 1, 1])];
+    parts.extend([
+        node("Concat", &means, "volume", std::slice::from_ref(&channels)),
+        node("AveragePool", &["volume"], "pooled", &near),
+        node("Softmax", &["pooled"], "weights", &[channels]),
+        node("Conv", &["weights", "offsets"], "argmax", &[]),
+    ]);
+    parts.extend(["older", "newer", "grid", "offsets"].map(|name| value(11, name)));
+    parts.extend(["volume", "argmax"].map(|name| value(12, name)));
     let config = Config { threads: 1, ..Config::default() };
-    Graph::of(&config, "the sliced cost volume".into(), &model, 4)
+    Graph::of(&config, "the sliced cost volume".into(), &model(17, &parts), 4)
 }
 
 /// Where flow leads, as GridSample takes it.

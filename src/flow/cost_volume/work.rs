@@ -331,7 +331,7 @@ impl Seek<'_> {
             for row in plane[(first + 1) * width..end * width].chunks_exact(width) {
                 within.iter_mut().zip(row).for_each(|(sum, value)| *sum += value);
             }
-            // A division, as in the plain graph's operator: where nothing matches anything a network makes much of last digits.
+            // A division, as in the plain graph's operator: see `through_grid` in `operator.rs`.
             let (cells, scale) = (lanes.splat(3.0 * rows), lanes.splat(self.scale));
             for (x, pooled) in pooled.chunks_exact_mut(L::COUNT).enumerate() {
                 let sums = &sums[x * L::COUNT..][..L::COUNT + 2];

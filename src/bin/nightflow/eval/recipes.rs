@@ -23,7 +23,7 @@ Examples:
 Of each set --out gets recipes_SET.md (mean end-point error over pairs ± deviation over the draws of the noise), \
 recipes_SET.svg and recipes_SET.json, as soon as it is through. The paper's own table is printed below in the same shape. \
 What a network was trained on is the last part of its name. All of it takes as long as models × enhancers × draws × 7 \
-ladders: with the 200 pairs above, an hour on two cores; --only takes less.")]
+ladders: with the 200 pairs above, over an hour on two cores; --only takes less.")]
 pub struct Args {
     /// Data sets with true flow, or folders of NAME_img1.*, NAME_img2.*, NAME_flow.flo; sRGB pictures.
     #[arg(required = true)]
