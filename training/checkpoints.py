@@ -69,7 +69,8 @@ def of_graphs(name: Path) -> dict[str, torch.Tensor]:
     for file in sorted(name.parent.glob(f"{name.name}_*.onnx")):
         for tensor in onnx.load(file).graph.initializer:
             # A copy, for what onnx gives may not be written to.
-            found[tensor.name.removesuffix("_half")] = torch.tensor(onnx.numpy_helper.to_array(tensor)).float()
+            known = tensor.name.removesuffix("_half").removeprefix("network.")
+            found[known] = torch.tensor(onnx.numpy_helper.to_array(tensor)).float()
     if not found:
         raise FileNotFoundError(f"expected graphs {name}_*.onnx, found none")
     return found

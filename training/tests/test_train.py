@@ -37,12 +37,17 @@ def steps(run: Run, textures: Textures, count: int) -> None:
         run.train_step(*batch_of(textures, crop["height"], crop["width"], run.noise(crop["batch"])))
 
 
-def test_a_run_starts_from_the_graphs_of_a_network():
-    name = Path(__file__).parents[2] / "models" / "pwcnet_fcdn"
+@pytest.mark.parametrize("network", ["pwcnet", "raftsmall"])
+def test_a_run_starts_from_the_graphs_of_a_network(network):
+    name = Path(__file__).parents[2] / "models" / f"{network}_fcdn"
     held = checkpoints.of_graphs(name)
-    run = Run(DESCRIPTION | {"start": str(name)})
+    run = Run(DESCRIPTION | {"network": network, "iterations": 1, "start": str(name)})
     for key, value in run.network.state_dict().items():
         assert torch.equal(value, held[key]), key
+
+
+def test_a_run_starts_from_no_other_networks_graphs():
+    name = Path(__file__).parents[2] / "models" / "pwcnet_fcdn"
     with pytest.raises(ValueError, match="is unknown"):
         Run(DESCRIPTION | {"network": "raftsmall", "iterations": 1, "start": str(name)})
     with pytest.raises(FileNotFoundError, match="pwcnet_none"):
