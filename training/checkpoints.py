@@ -68,8 +68,9 @@ def of_graphs(name: Path) -> dict[str, torch.Tensor]:
     found = {}
     for file in sorted(name.parent.glob(f"{name.name}_*.onnx")):
         for tensor in onnx.load(file).graph.initializer:
-            # A copy, for what onnx gives may not be written to.
+            # RAFT-small is exported as a part of what calls it.
             known = tensor.name.removesuffix("_half").removeprefix("network.")
+            # A copy, for what onnx gives may not be written to.
             found[known] = torch.tensor(onnx.numpy_helper.to_array(tensor)).float()
     if not found:
         raise FileNotFoundError(f"expected graphs {name}_*.onnx, found none")
