@@ -61,7 +61,7 @@ pub enum Precision {
     /// 32 bits.
     #[default]
     Fp32,
-    /// 16 bits with the exponent of 32, on processors that have it: by the node's own operators and AMX with `cpu`, see
+    /// 16 bits with the exponent of 32, on processors that have it: by the node's own operators with `cpu`, see
     /// [`crate::flow::convolutions`], or by OpenVINO and TensorRT.
     Bf16,
     /// 16 bits, by TensorRT and ACL.
@@ -164,7 +164,7 @@ pub const REASONS: &[(&str, &str)] = &[
     ("provider", "cpu: the library that the build fetches has no other; models/README.md says what others bring"),
     (
         "precision",
-        "fp32: what every processor has, and what the golden output was noted with; bf16 is twice as fast on processors with AMX, which nightflow doctor names",
+        "fp32: what every processor has, and what the golden output was noted with; bf16 is faster on processors with AMX or with bf16 in AVX-512, which nightflow doctor names",
     ),
     (
         "resolution",

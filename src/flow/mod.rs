@@ -8,6 +8,7 @@ pub mod cost_volume;
 mod error;
 mod fake;
 mod golden;
+mod lanes;
 pub mod manifest;
 mod matcher;
 mod network;
@@ -21,6 +22,7 @@ mod refine;
 pub mod runtime;
 mod trust;
 pub mod wheel;
+pub mod winograd;
 
 use crate::clock::Stamp;
 

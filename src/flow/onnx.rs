@@ -242,8 +242,8 @@ fn chosen(config: &Config, entry: &mut manifest::Entry) -> Result<Operators, Err
             ));
         }
         if !convolutions::Unit::best().is_fast() {
-            let reason = "it needs a processor with AMX (Intel's Xeons since 2023) and Linux 5.16 or newer, which this machine \
-                          hasn't; provider = \"openvino\" has it on processors with AVX-512, and fp32 runs anywhere";
+            let reason = "it needs Linux and a processor with bf16 in AVX-512 (AMD's since Zen 4) or AMX (Intel's Xeons since 2023), \
+                          which this machine hasn't; fp32 runs anywhere";
             return Err(unfit(reason.into()));
         }
         let Some((pyramid, decoder)) = entry.pyramid_bf16.take().zip(entry.decoder_bf16.take()) else {
@@ -310,7 +310,8 @@ impl Onnx {
         provider::check(config, &assigned)?;
         let library = loaded.1.clone();
         let tiles = config.provider == Provider::Cpu && precision == Precision::Bf16;
-        let tiles = if tiles { ", its convolutions the node's own, in bf16 by AMX" } else { "" };
+        let unit = convolutions::Unit::best().name();
+        let tiles = if tiles { format!(", its convolutions the node's own, in bf16 by {unit}") } else { String::new() };
         let provider = format!("{} of ONNX Runtime {}{tiles}", provider::named(&assigned), provider::version(&library));
         let fixes = config.provider.fixes_sizes();
         let fixed = fixes.then(|| Fixed { loaded: loaded.clone(), config: config.clone(), bytes });

@@ -77,7 +77,7 @@ fn processor() -> Finding {
         ("AVX-512", is_x86_feature_detected!("avx512f")),
         ("VNNI", is_x86_feature_detected!("avx512vnni")),
         ("BF16", is_x86_feature_detected!("avx512bf16")),
-        ("AMX", Unit::best().is_fast()),
+        ("AMX", Unit::best().name() == "AMX"),
     ];
     #[cfg(target_arch = "aarch64")]
     let features = [("NEON", std::arch::is_aarch64_feature_detected!("neon"))];

@@ -1,4 +1,5 @@
-//! The operators `nightflow::Convolutions` and `nightflow::Encoder`: convolutions in bf16 by the processor's matrix tiles.
+//! The operators `nightflow::Convolutions` and `nightflow::Encoder`: convolutions in bf16 by the processor's matrix tiles or dot
+//! products, and (by [`super::winograd`]) in 32 bits.
 //!
 //! Pixels lie with their channels side by side ([`map`]), so that a tile of 16 pixels is read as it is, for every weight from
 //! another place ([`layer`]): no copy of the picture is made for the multiplication's sake. Products are of bf16, sums of 32
@@ -7,6 +8,8 @@
 //! does not depend on how many threads there are.
 
 mod chain;
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+mod dots;
 mod encoder;
 mod layer;
 mod map;

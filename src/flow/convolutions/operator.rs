@@ -9,12 +9,16 @@ use ort::{
 };
 
 use super::{CONVOLUTIONS, Chain, Encoder, Layer, Step, Unit, Weights, chain, encoder};
-use crate::flow::operators::{input, output, spread};
+use crate::flow::{
+    operators::{input, output, spread},
+    winograd,
+};
 
 const CHAIN: &str = "Convolutions";
 const ENCODER: &str = "Encoder";
-/// Smaller pictures than this are not worth waking other threads for.
+/// Smaller pictures than this are not worth waking other threads for, in 16 bits and in 32.
 const CELLS_SPREAD_MIN: usize = 512;
+const CELLS_SPREAD_MIN_WIDE: usize = 64;
 /// The most tensors that are read as one.
 const PARTS_MAX: usize = 8;
 /// The farthest apart that weights may lie.
@@ -22,6 +26,12 @@ const DILATION_MAX: i64 = 64;
 
 impl From<chain::Unfit> for Error {
     fn from(unfit: chain::Unfit) -> Self {
+        Error::new(unfit.to_string())
+    }
+}
+
+impl From<winograd::Unfit> for Error {
+    fn from(unfit: winograd::Unfit) -> Self {
         Error::new(unfit.to_string())
     }
 }
@@ -34,7 +44,8 @@ impl From<encoder::Unfit> for Error {
 
 /// `nightflow::Convolutions(part [1, C, H, W] …, weight [O, I, K, K], bias [O] …)`: the parts are read as if they were
 /// concatenated; each weight and bias is a layer that keeps the size. Attributes: how many `parts`, and for each layer one of
-/// `dilations` and of `slopes`, what negative results are multiplied with. Outputs: the last layer's and the one before's.
+/// `dilations` and of `slopes`, what negative results are multiplied with; and of how many `bits` the factors are, 16 (bf16) or
+/// 32, then for weights of 3 × 3 alone. Outputs: the last layer's and the one before's.
 pub struct Convolutions;
 
 /// `nightflow::Encoder(image [1, 3, H, W], weight, bias …)`: RAFT-small's feature encoder, convolutions in the order in which
@@ -44,7 +55,13 @@ pub struct Encode;
 /// A node of a graph.
 pub struct ChainNode {
     parts: usize,
-    work: Chain,
+    work: Work,
+}
+
+/// By the bits of the factors.
+enum Work {
+    Sixteen(Chain),
+    ThirtyTwo(winograd::Chain),
 }
 
 /// A node of a graph.
@@ -105,7 +122,8 @@ impl Operator for Convolutions {
             let found = format!("{inputs} inputs, {outputs} outputs, {parts} parts, {dilations:?}, {slopes:?}");
             return Err(Error::new(format!("{CHAIN}: parts, dilations and slopes don't fit: {found}")));
         }
-        let (mut layers, mut channels) = (vec![], None);
+        let bits: i64 = attributes.get("bits").unwrap_or(16);
+        let (mut narrow, mut wide, mut channels) = (vec![], vec![], None);
         for (number, (dilation, slope)) in dilations.into_iter().zip(slopes).enumerate() {
             let (shape, weights, bias) = layer(attributes, CHAIN, parts + 2 * number)?;
             if channels.is_some_and(|channels| channels != shape[1]) {
@@ -115,10 +133,24 @@ impl Operator for Convolutions {
                 )));
             }
             channels = Some(shape[0]);
-            let step = Step { stride: [1; 2], dilation: dilation as usize, slope };
-            layers.push(Layer::new(&weights, shape, &bias, step));
+            let dilation = dilation as usize;
+            match (bits, shape) {
+                (16, _) => narrow.push(Layer::new(&weights, shape, &bias, Step { stride: [1; 2], dilation, slope })),
+                (32, [outputs, inputs, 3, 3]) => {
+                    let unit = winograd::Unit::best();
+                    wide.push(winograd::Layer::new(unit, &weights, [outputs, inputs], &bias, dilation, slope));
+                }
+                _ => {
+                    let found = format!("layer {number} has {bits} and {shape:?}");
+                    return Err(Error::new(format!("{CHAIN}: bits should be 16, or 32 for weights of 3 × 3: {found}")));
+                }
+            }
         }
-        Ok(ChainNode { parts, work: Chain::new(Unit::best(), layers) })
+        let work = match bits {
+            32 => Work::ThirtyTwo(winograd::Chain::new(winograd::Unit::best(), wide)),
+            _ => Work::Sixteen(Chain::new(Unit::best(), narrow)),
+        };
+        Ok(ChainNode { parts, work })
     }
 }
 
@@ -129,8 +161,8 @@ fn size(lengths: &[i64]) -> Option<[usize; 2]> {
 }
 
 /// Calls every piece of work, on the session's threads where that pays.
-fn shared(context: &ComputeContext, cells: usize, count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<()> {
-    if cells < CELLS_SPREAD_MIN {
+fn shared(context: &ComputeContext, pays: bool, count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<()> {
+    if !pays {
         (0..count).for_each(work);
         return Ok(());
     }
@@ -152,13 +184,24 @@ impl Kernel for ChainNode {
             }
             *part = values;
         }
-        let [outputs, kept] = self.work.outputs();
+        let [outputs, kept] = match &self.work {
+            Work::Sixteen(chain) => chain.outputs(),
+            Work::ThirtyTwo(chain) => chain.outputs(),
+        };
         let of = |channels: usize| [1, channels as i64, height as i64, width as i64];
         let last = output(context, 0, of(outputs))?;
         let before = if context.num_outputs()? > 1 { Some(output(context, 1, of(kept))?) } else { None };
         let cells = height * width;
-        let spread = |count: usize, work: &(dyn Fn(usize) + Sync)| shared(context, cells, count, work);
-        self.work.run(&parts[..self.parts], [height, width], last, before, &spread)
+        let least = match self.work {
+            Work::Sixteen(_) => CELLS_SPREAD_MIN,
+            Work::ThirtyTwo(_) => CELLS_SPREAD_MIN_WIDE,
+        };
+        let spread = |count: usize, work: &(dyn Fn(usize) + Sync)| shared(context, cells >= least, count, work);
+        let parts = &parts[..self.parts];
+        match &mut self.work {
+            Work::Sixteen(chain) => chain.run(parts, [height, width], last, before, &spread),
+            Work::ThirtyTwo(chain) => chain.run(parts, [height, width], last, before, &spread),
+        }
     }
 }
 
@@ -206,7 +249,9 @@ impl Kernel for EncoderNode {
         let of = |channels: usize, part: usize| [1, channels, height / part, width / part].map(|length| length as i64);
         let quarter = output(context, 0, of(channels[0], 4))?;
         let eighth = output(context, 1, of(channels[1], 8))?;
-        let spread = |count: usize, work: &(dyn Fn(usize) + Sync)| shared(context, height * width, count, work);
+        let spread = |count: usize, work: &(dyn Fn(usize) + Sync)| {
+            shared(context, height * width >= CELLS_SPREAD_MIN, count, work)
+        };
         self.work.run(image, [height, width], quarter, eighth, &spread)
     }
 }

@@ -1,7 +1,11 @@
 //! Products of tiles of bf16: 32 pixels with 32 channels of the output, 32 channels of the input at a time.
 //!
-//! Intel's AMX does them in its tile registers; other processors get the same sums from what the compiler makes of arrays,
-//! which serves tests and not speed. The instructions are written out, for Rust has no stable functions for them.
+//! Intel's AMX does them in its tile registers, AVX-512 with bf16 two products a number at a time; other processors get the
+//! same sums from what the compiler makes of arrays, which serves tests and not speed. AMX's instructions are written out, for
+//! Rust has no stable functions for them.
+
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+use super::dots;
 
 /// 32 numbers of 16 bits: a cache line, a row of a tile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -42,9 +46,29 @@ impl Sums {
 pub enum Unit {
     /// Arrays.
     Plain,
+    /// Dot products of AVX-512. Only [`Unit::all`] gives it, where there are such.
+    #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+    Dots(Vectors),
     /// The tile registers of AMX. Only [`Unit::all`] gives it, where they may be used.
     #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
     Amx(Permitted),
+}
+
+/// The proof that the processor has AVX-512 with bf16: AMD's since 2022 (Zen 4), and Intel's that have AMX.
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Vectors(());
+
+#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+impl Vectors {
+    fn ask() -> Option<Self> {
+        let all = is_x86_feature_detected!("avx512f")
+            && is_x86_feature_detected!("avx512bw")
+            && is_x86_feature_detected!("avx512vl")
+            && is_x86_feature_detected!("avx512dq")
+            && is_x86_feature_detected!("avx512bf16");
+        all.then_some(Self(()))
+    }
 }
 
 /// The proof that the processor has AMX with bf16 and that the kernel lets this process use it.
@@ -66,14 +90,10 @@ impl Permitted {
             return None;
         }
         // The sums are finished with the vectors of AVX-512; no processor has the one without the other.
-        let vectors = is_x86_feature_detected!("avx512f")
-            && is_x86_feature_detected!("avx512bw")
-            && is_x86_feature_detected!("avx512vl")
-            && is_x86_feature_detected!("avx512dq")
-            && is_x86_feature_detected!("avx512bf16");
+        Vectors::ask()?;
         // SAFETY: the call takes two numbers and touches no memory of ours.
         let answer = unsafe { libc::syscall(libc::SYS_arch_prctl, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA) };
-        (vectors && answer == 0).then_some(Self(()))
+        (answer == 0).then_some(Self(()))
     }
 }
 
@@ -83,6 +103,7 @@ impl Unit {
         let mut units = vec![Self::Plain];
         #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
         {
+            units.extend(Vectors::ask().map(Self::Dots));
             static PERMITTED: std::sync::OnceLock<Option<Permitted>> = std::sync::OnceLock::new();
             units.extend(PERMITTED.get_or_init(Permitted::ask).map(Self::Amx));
         }
@@ -97,6 +118,17 @@ impl Unit {
     /// Whether it is made for this.
     pub fn is_fast(self) -> bool {
         self != Self::Plain
+    }
+
+    /// As people call it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Plain => "arrays",
+            #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+            Self::Dots(_) => "AVX-512",
+            #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+            Self::Amx(_) => "AMX",
+        }
     }
 
     /// Takes the tile registers for this thread until the guard goes.
@@ -145,8 +177,8 @@ impl Unit {
         match self {
             Self::Plain => work.on(&begun),
             #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-            // SAFETY: `Permitted` proves that the processor has these vectors.
-            Self::Amx(_) => unsafe { within(&begun, work) },
+            // SAFETY: `Vectors` and `Permitted` prove that the processor has these vectors.
+            Self::Dots(_) | Self::Amx(_) => unsafe { within(&begun, work) },
         }
     }
 }
@@ -188,6 +220,9 @@ impl Begun {
         assert!(!offsets.is_empty() && furthest < pixels.len() && weights.len() == offsets.len() * STEP, "{furthest}");
         match self.0 {
             Unit::Plain => plain(block, sums),
+            #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
+            // SAFETY: `Vectors` proves that the processor has them.
+            Unit::Dots(_) => unsafe { dots::multiply(block, sums) },
             #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
             // SAFETY: `begin` has set the tiles' shapes; every line that is read was just seen to be there, since the last
             // offset is the greatest; `Sums` is as large as four tiles.

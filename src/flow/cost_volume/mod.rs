@@ -12,14 +12,16 @@
 //! [`work`] does it in four, none of which takes memory, and [`operator`] lets ONNX Runtime call them. Every result is
 //! computed by one thread in a fixed order, so that it does not depend on how many threads there are.
 
-mod lanes;
 mod operator;
 #[cfg(test)]
 pub(super) mod tests;
 mod work;
 
-use crate::flow::bands::{self, Bands};
-pub use lanes::Unit;
+pub use crate::flow::lanes::Unit;
+use crate::flow::{
+    bands::{self, Bands},
+    lanes,
+};
 pub use operator::Fused;
 use work::{Fetch, Multiply, Seek, Turn};
 

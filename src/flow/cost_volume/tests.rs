@@ -4,7 +4,7 @@ use std::cell::Cell;
 
 use proptest::prelude::*;
 
-use super::{lanes::Unit, *};
+use super::*;
 
 struct Case {
     shape: Shape,

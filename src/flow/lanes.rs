@@ -188,6 +188,8 @@ macro_rules! by_intrinsics {
             type V = $register;
 
             fn enter<W: Work>(self, work: W) {
+                // Of its own, so that a piece of work has the registers to itself.
+                #[inline(never)]
                 #[target_feature(enable = $features)]
                 fn within<W: Work>(lanes: $name, work: W) {
                     work.on(lanes);

@@ -1,0 +1,162 @@
+//! Convolutions one after the other, from planes to planes.
+
+use std::sync::{Mutex, TryLockError};
+
+use super::{
+    Unit,
+    layer::{Convolve, Layer},
+    pixels::{LINE, Pack, Pixels, Unpack, skipped},
+};
+use crate::flow::{bands::Bands, convolutions::Spread};
+
+/// The operator `nightflow::Convolutions` in 32 bits with its memory, which is taken at the first call of a size.
+#[derive(Debug)]
+pub struct Chain {
+    unit: Unit,
+    layers: Vec<Layer>,
+    /// What each layer reads, and what the last one gives.
+    maps: Vec<Pixels>,
+    own: Own,
+}
+
+/// What bands need for themselves, one piece for each, of which every thread keeps to the first that it finds free: so it stays
+/// in the caches, and what is never needed is never touched.
+#[derive(Debug, Default)]
+struct Own {
+    pieces: Vec<Mutex<Vec<f32>>>,
+    each: usize,
+}
+
+impl Own {
+    fn resize(&mut self, bands: usize, each: usize) {
+        if bands > self.pieces.len() || each > self.each {
+            self.each = each.max(self.each);
+            self.pieces = (0..bands.max(self.pieces.len())).map(|_| Mutex::new(vec![0.0; self.each + LINE])).collect();
+        }
+    }
+
+    /// Nobody ever waits: there is a piece for each band.
+    fn with(&self, work: impl FnOnce(&mut [f32])) {
+        let free = self.pieces.iter().find_map(|piece| match piece.try_lock() {
+            Ok(piece) => Some(piece),
+            Err(TryLockError::Poisoned(piece)) => Some(piece.into_inner()),
+            Err(TryLockError::WouldBlock) => None,
+        });
+        let Some(mut piece) = free else { return work(&mut vec![0.0; self.each]) };
+        let skipped = skipped(&piece);
+        work(&mut piece[skipped..]);
+    }
+}
+
+/// What does not fit.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("convolutions of {height} × {width}, {inputs} channels to {outputs}, can't have {found} values in and out")]
+pub struct Unfit {
+    height: usize,
+    width: usize,
+    inputs: usize,
+    outputs: usize,
+    found: String,
+}
+
+impl Chain {
+    /// Layers for this unit, each with as many inputs as the one before has outputs; at least one.
+    pub fn new(unit: Unit, layers: Vec<Layer>) -> Self {
+        let maps = (0..=layers.len()).map(|_| Pixels::default()).collect();
+        Self { unit, layers, maps, own: Own::default() }
+    }
+
+    /// Channels that come out, and those of the layer before the last.
+    pub fn outputs(&self) -> [usize; 2] {
+        let mut back = self.layers.iter().rev().map(Layer::outputs);
+        [back.next().unwrap_or(0), back.next().unwrap_or(0)]
+    }
+
+    /// Computes everything: `parts` are planes that are read as if they were one tensor after the other, `before` is what the
+    /// layer before the last gives, if that is wanted.
+    pub fn run<E: From<Unfit>>(
+        &mut self,
+        parts: &[&[f32]],
+        size: [usize; 2],
+        last: &mut [f32],
+        before: Option<&mut [f32]>,
+        spread: &impl Spread<E>,
+    ) -> Result<(), E> {
+        let [height, width] = size;
+        let cells = height * width;
+        let inputs = self.layers.first().map_or(0, Layer::inputs);
+        let [outputs, kept] = self.outputs();
+        let sum: usize = parts.iter().map(|part| part.len()).sum();
+        let whole = parts.iter().all(|part| cells > 0 && part.len() % cells == 0) && sum == inputs * cells;
+        let fits = before.as_ref().is_none_or(|before| self.layers.len() > 1 && before.len() == kept * cells);
+        if !whole || last.len() != outputs * cells || !fits {
+            let found = format!("{sum}, {} and {:?}", last.len(), before.map(|before| before.len()));
+            return Err(Unfit { height, width, inputs, outputs, found }.into());
+        }
+        self.resize(size);
+        let Self { unit, layers, maps, own } = self;
+        let (unit, count) = (*unit, layers.len());
+        let rows = height.div_ceil(PACKED);
+        let ([margin, _], depth) = (maps[0].margins, maps[0].depth());
+        let to = maps[0].cut(rows);
+        spread(height.div_ceil(rows), &|number| {
+            if let Some(to) = to.take(number) {
+                unit.run(Pack { parts, size, before: margin, depth, to });
+            }
+        })?;
+        for (index, layer) in layers.iter().enumerate() {
+            let (read, written) = maps.split_at_mut(index + 1);
+            convolve(unit, layer, &read[index], &mut written[0], own, spread)?;
+        }
+        unpack(unit, &maps[count], last, spread)?;
+        before.map_or(Ok(()), |before| unpack(unit, &maps[count - 1], before, spread))
+    }
+
+    /// Memory for pictures of this size.
+    fn resize(&mut self, [height, width]: [usize; 2]) {
+        let (mut bands, mut each) = (0, 0);
+        for (index, map) in self.maps.iter_mut().enumerate() {
+            let Some(layer) = self.layers.get(index) else { break };
+            map.resize([layer.inputs(), height, width], layer.margins());
+            bands = bands.max(height.div_ceil(layer.band([height, width])));
+            each = each.max(layer.scratch([height, width]));
+        }
+        if let (Some(map), Some(layer)) = (self.maps.last_mut(), self.layers.last()) {
+            map.resize([layer.outputs(), height, width], [0; 2]);
+        }
+        self.own.resize(bands, each);
+    }
+}
+
+/// How many bands planes are cut into where they become pixels and the other way round.
+const PACKED: usize = 8;
+
+fn convolve<E>(
+    unit: Unit,
+    layer: &Layer,
+    from: &Pixels,
+    to: &mut Pixels,
+    own: &Own,
+    spread: &impl Spread<E>,
+) -> Result<(), E> {
+    let [_, height, width] = from.shape;
+    let rows = layer.band([height, width]);
+    let (before, depth, bands) = (to.margins[0], to.depth(), height.div_ceil(rows));
+    let to = to.cut(rows);
+    spread(bands, &|number| {
+        if let Some(to) = to.take(number) {
+            own.with(|scratch| unit.run(Convolve { layer, from, before, depth, scratch, to }));
+        }
+    })
+}
+
+fn unpack<E>(unit: Unit, from: &Pixels, to: &mut [f32], spread: &impl Spread<E>) -> Result<(), E> {
+    let [_, height, _] = from.shape;
+    let rows = height.div_ceil(PACKED);
+    let to = Bands::new(to, from.shape, rows);
+    spread(height.div_ceil(rows), &|number| {
+        if let Some(to) = to.take(number) {
+            unit.run(Unpack { from, to });
+        }
+    })
+}

@@ -1,0 +1,133 @@
+//! The operator against convolutions as they are defined, in 64 bits.
+
+use std::convert::Infallible;
+
+use proptest::prelude::*;
+use rayon::prelude::*;
+
+use super::*;
+use crate::flow::cost_volume::tests::noise;
+
+impl From<Unfit> for Infallible {
+    fn from(unfit: Unfit) -> Self {
+        panic!("{unfit}")
+    }
+}
+
+/// Every band on one thread, and backwards, which must not matter.
+fn backwards(count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<(), Infallible> {
+    (0..count).rev().for_each(work);
+    Ok(())
+}
+
+/// On as many threads as there are.
+fn shared(count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<(), Infallible> {
+    (0..count).into_par_iter().for_each(work);
+    Ok(())
+}
+
+/// A convolution of 3 × 3 with zeros around, and its activation.
+fn convolved(
+    from: &[f64],
+    [height, width]: [usize; 2],
+    weights: &[f32],
+    bias: &[f32],
+    dilation: usize,
+    slope: f32,
+) -> Vec<f64> {
+    let (cells, inputs) = (height * width, from.len() / (height * width));
+    let at = |c: usize, y: isize, x: isize| {
+        let inside = (0..height as isize).contains(&y) && (0..width as isize).contains(&x);
+        if inside { from[c * cells + y as usize * width + x as usize] } else { 0.0 }
+    };
+    let mut values = vec![];
+    for (o, bias) in bias.iter().enumerate() {
+        for (y, x) in (0..height).flat_map(|y| (0..width).map(move |x| (y, x))) {
+            let mut sum = f64::from(*bias);
+            for (i, tap) in (0..inputs).flat_map(|i| (0..9).map(move |tap| (i, tap))) {
+                let moved = |start: usize, tap: usize| start as isize + (tap as isize - 1) * dilation as isize;
+                sum += f64::from(weights[(o * inputs + i) * 9 + tap]) * at(i, moved(y, tap / 3), moved(x, tap % 3));
+            }
+            values.push(if sum < 0.0 { f64::from(slope) * sum } else { sum });
+        }
+    }
+    values
+}
+
+/// The greatest difference, as a part of the root of the mean square of the numbers.
+fn apart(found: &[f32], wanted: &[f64]) -> f64 {
+    assert_eq!(found.len(), wanted.len());
+    let size = (wanted.iter().map(|v| v * v).sum::<f64>() / wanted.len() as f64).sqrt();
+    found.iter().zip(wanted).map(|(a, b)| (f64::from(*a) - b).abs()).fold(0.0, f64::max) / size.max(1e-12)
+}
+
+fn chain_is_as_defined(size: [usize; 2], widths: &[usize], dilations: &[usize], seed: u64) {
+    let (cells, last) = (size[0] * size[1], widths.len() - 2);
+    let slope = |i: usize| if i == last { 1.0 } else { 0.1 };
+    let weights: Vec<Vec<f32>> =
+        (0..=last).map(|i| noise(seed + 10 + i as u64, widths[i] * widths[i + 1] * 9)).collect();
+    let bias: Vec<Vec<f32>> = (0..=last).map(|i| noise(seed + 50 + i as u64, widths[i + 1])).collect();
+    let image = noise(seed, widths[0] * cells);
+    let mut wanted = vec![image.iter().map(|v| f64::from(*v)).collect::<Vec<_>>()];
+    for i in 0..=last {
+        wanted.push(convolved(&wanted[i], size, &weights[i], &bias[i], dilations[i], slope(i)));
+    }
+    let (one, rest) = image.split_at(cells * (widths[0] / 2));
+    let parts = if one.is_empty() { vec![rest] } else { vec![one, rest] };
+    for unit in Unit::all() {
+        let layer =
+            |i: usize| Layer::new(unit, &weights[i], [widths[i + 1], widths[i]], &bias[i], dilations[i], slope(i));
+        let mut chain = Chain::new(unit, (0..=last).map(layer).collect());
+        let mut results = vec![];
+        for threads in 0..2 {
+            let mut given = vec![f32::NAN; widths[last + 1] * cells];
+            let mut kept = vec![f32::NAN; if last > 0 { widths[last] * cells } else { 0 }];
+            let before = (last > 0).then_some(&mut kept[..]);
+            let Ok(()) = match threads {
+                0 => chain.run(&parts, size, &mut given, before, &backwards),
+                _ => chain.run(&parts, size, &mut given, before, &shared),
+            };
+            let error = apart(&given, &wanted[last + 1]);
+            assert!(error < 1e-4, "{unit:?}, {size:?} {widths:?} {dilations:?}: {error}");
+            assert!(last == 0 || apart(&kept, &wanted[last]) < 1e-4);
+            results.push((given, kept));
+        }
+        assert_eq!(results[0], results[1], "one and two threads give the same");
+    }
+}
+
+#[test]
+fn a_chain_is_convolutions_one_after_the_other() {
+    chain_is_as_defined([8, 10], &[181, 128, 64, 3], &[1, 1, 1], 1);
+    chain_is_as_defined([32, 40], &[34, 64, 32, 2], &[2, 8, 1], 2);
+    chain_is_as_defined([2, 2], &[3, 33], &[4], 3);
+    chain_is_as_defined([1, 1], &[1, 1], &[1], 4);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+    #[test]
+    fn a_chain_of_any_size_is_as_defined(
+        height in 1usize..20, width in 1usize..40, inputs in 1usize..70, middle in 1usize..70, outputs in 1usize..70,
+        dilations in prop::array::uniform2(1usize..5), seed in 0u64..1000,
+    ) {
+        chain_is_as_defined([height, width], &[inputs, middle, outputs], &dilations, seed);
+    }
+}
+
+#[test]
+fn what_does_not_fit_is_refused() {
+    let unit = Unit::best();
+    let mut chain = Chain::new(unit, vec![Layer::new(unit, &[0.0; 18], [1, 2], &[0.0], 1, 1.0)]);
+    let mut run = |values: usize, given: usize| {
+        chain.run::<Unfit>(&[&vec![0.0; values]], [2, 3], &mut vec![0.0; given], None, &|count, work| {
+            (0..count).for_each(work);
+            Ok(())
+        })
+    };
+    assert!(run(12, 6).is_ok());
+    for (values, given) in [(11, 6), (18, 6), (12, 5)] {
+        let said = run(values, given).unwrap_err().to_string();
+        assert!(said.contains("convolutions of 2 × 3, 2 channels to 1"), "{said}");
+    }
+}
