@@ -6,7 +6,7 @@ set -euo pipefail
 cd "$(dirname "$0")"
 minutes=$1 python=${2:-python3}
 for run in fcdn clean; do
-  "$python" train.py "gpu_$run.toml" --minutes "$minutes" --every 1 --resume --threads 4 &
+  "$python" train.py "pixels_$run.toml" --minutes "$minutes" --every 1 --resume --threads 4 &
   runs+=($!)
 done
 for run in "${runs[@]}"; do wait "$run"; done

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import functools
 import hashlib
 import io
 import tomllib
@@ -77,35 +78,22 @@ class CostVolume(torch.autograd.Function):
         return volume, argmax
 
 
-@contextlib.contextmanager
-def fused(network: PwcNet):
-    """Within it the decoder's levels match by the one operator."""
-    levels = (network.decoder.shared, network.decoder.fine)
-    for level in levels:
-        level.match = lambda older, newer, flow, tile, fetch, level=level: CostVolume.apply(
-            older, newer, flow, level.sharpness, level.reach
-        )
-    try:
-        yield
-    finally:
-        for level in levels:
-            del level.match
-
-
 class Convolutions(torch.autograd.Function):
-    """Convolutions one after the other in bf16, as the node's own operator `nightflow::Convolutions`. Its definition stands in
-    src/flow/convolutions; tracing asks for shapes only."""
+    """Convolutions one after the other, of factors of so many bits, as the node's own operator `nightflow::Convolutions`. Its
+    definition stands in models/README.md; tracing asks for shapes only."""
 
     @staticmethod
-    def forward(ctx, parts: int, dilations: list[int], slopes: list[float], kept: bool, *tensors):
+    def forward(ctx, bits: int, parts: int, dilations: list[int], slopes: list[float], kept: bool, *tensors):
         channels = [bias.numel() for bias in tensors[parts + 1 :: 2]]
         of = lambda count: tensors[0].new_zeros(1, count, *tensors[0].shape[2:])
         return (of(channels[-1]), of(channels[-2])) if kept else of(channels[-1])
 
     @staticmethod
-    def symbolic(g, parts: int, dilations: list[int], slopes: list[float], kept: bool, *tensors):
+    def symbolic(g, bits: int, parts: int, dilations: list[int], slopes: list[float], kept: bool, *tensors):
         channels = [bias.type().sizes()[0] for bias in tensors[parts + 1 :: 2]]
         settings = {"parts_i": parts, "dilations_i": dilations, "slopes_f": slopes}
+        # 16 is what it is if nothing is said.
+        settings |= {"bits_i": bits} if bits != 16 else {}
         found = g.op(f"{DOMAIN}::Convolutions", *tensors, outputs=2 if kept else 1, **settings)
         for value, count in zip(found if kept else [found], reversed(channels)):
             value.setType(tensors[0].type().with_sizes([1, count, None, None]))
@@ -137,34 +125,49 @@ def convolutions_of(layers: nn.Sequential) -> tuple[list[nn.Conv2d], list[float]
     return [part for part, _ in both], [slope for _, slope in both]
 
 
-def chained(layers: nn.Sequential, parts: list[torch.Tensor], kept: bool = False):
+def chained(layers: nn.Sequential, parts: list[torch.Tensor], kept: bool = False, *, bits: int):
     """What `networks.through` gives, by the one operator; with `kept` also what the layer before the last gives."""
     convolutions, slopes = convolutions_of(layers)
     weights = [tensor for convolution in convolutions for tensor in (convolution.weight, convolution.bias)]
     dilations = [convolution.dilation[0] for convolution in convolutions]
-    return Convolutions.apply(len(parts), dilations, slopes, kept, *parts, *weights)
+    return Convolutions.apply(bits, len(parts), dilations, slopes, kept, *parts, *weights)
+
+
+@contextlib.contextmanager
+def fused(network: PwcNet, bits: int = 32):
+    """Within it the decoder's levels match by the one operator, and convolve by the other."""
+    decoder = network.decoder
+    levels, plain = (decoder.shared, decoder.fine), decoder.through
+    chain = functools.partial(chained, bits=bits)
+    for level in levels:
+        level.match = lambda older, newer, flow, tile, fetch, level=level: CostVolume.apply(
+            older, newer, flow, level.sharpness, level.reach
+        )
+        level.layers = lambda parts, level=level: chain(nn.Sequential(level.body, level.predict), parts, kept=True)
+    decoder.through = chain
+    try:
+        yield
+    finally:
+        for level in levels:
+            del level.match, level.layers
+        decoder.through = plain
 
 
 @contextlib.contextmanager
 def in_bf16(network: PwcNet):
-    """Within it levels match by their one operator, and convolve by the others."""
-    decoder, encoder = network.decoder, network.pyramid.encoder
-    plain = decoder.through
-    with fused(network):
-        for level in (decoder.shared, decoder.fine):
-            level.layers = lambda parts, level=level: chained(nn.Sequential(level.body, level.predict), parts, kept=True)
-        decoder.through = chained
-        # In the order of use; a unit registers its short cut last, which is where the operator looks for it.
-        parts = (encoder.conv1, encoder.layer1, encoder.layer2, encoder.layer3, encoder.conv2)
-        used = [p for part in parts for p in part.modules() if isinstance(p, nn.Conv2d)]
-        weights = [tensor for convolution in used for tensor in (convolution.weight, convolution.bias)]
-        middle = encoder.layer2[-1].conv3.out_channels
+    """Within it factors are of 16 bits, and the encoder is an operator too."""
+    encoder = network.pyramid.encoder
+    # In the order of use; a unit registers its short cut last, which is where the operator looks for it.
+    parts = (encoder.conv1, encoder.layer1, encoder.layer2, encoder.layer3, encoder.conv2)
+    used = [p for part in parts for p in part.modules() if isinstance(p, nn.Conv2d)]
+    weights = [tensor for convolution in used for tensor in (convolution.weight, convolution.bias)]
+    middle = encoder.layer2[-1].conv3.out_channels
+    with fused(network, bits=16):
         encoder.levels = lambda image: EncoderLevels.apply(image, middle, *weights)
         try:
             yield
         finally:
-            del encoder.levels, decoder.shared.layers, decoder.fine.layers
-            decoder.through = plain
+            del encoder.levels
 
 
 class RaftFrameGraph(nn.Module):

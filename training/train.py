@@ -51,13 +51,27 @@ def start(network: nn.Module, where: str) -> None:
         print(f"# {where} has no {', '.join(missing)}", flush=True)
 
 
-def loss_of(network, flows, expected, truth):
+def off(flow: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """End-point error [B, 1, H, W]; the root's slope stays finite where it is zero."""
+    return (flow - truth).square().sum(1, keepdim=True).add(1e-6).sqrt()
+
+
+def loss_of(network, flows, expected, truth, pixels: bool = False):
     """Weighed sum of end-point errors in pixels of the input, the likelihood of the error heads (exponential law), and the
-    last flow's error. `expected` is of the last flow, or a list of the last few."""
+    last flow's error. `expected` is of the last flow, or a list of the last few.
+
+    With `pixels` the last flow is judged as it is used, brought to every pixel: a cell that an edge runs through then takes
+    one side's motion rather than the mean of both, which is nobody's.
+    """
     total, errors = 0.0, []
-    for flow, weight in network.weighed(flows):
-        wanted = network.truth(truth, truth.shape[-1] // flow.shape[-1])
-        errors.append((flow - wanted).square().sum(1, keepdim=True).add(1e-6).sqrt())
+    weighed = network.weighed(flows)
+    for number, (flow, weight) in enumerate(weighed, 1):
+        cell = truth.shape[-1] // flow.shape[-1]
+        if pixels and number == len(weighed):
+            each = off(F.interpolate(flow, scale_factor=cell, mode="bilinear"), truth)
+            errors.append(F.avg_pool2d(each, cell))
+        else:
+            errors.append(off(flow, network.truth(truth, cell)))
         total = total + weight * errors[-1].mean()
     heads = expected if isinstance(expected, list) else [expected]
     pairs = list(zip(heads, (error.detach() for error in errors[-len(heads) :])))
@@ -83,6 +97,36 @@ def agreed(value: bool, seconds: float) -> tuple[bool, float]:
     said = torch.tensor([float(value), seconds], dtype=torch.float64)
     dist.broadcast(said, 0)
     return bool(said[0]), said[1].item()
+
+
+class Replayed:
+    """A run's update as one CUDA graph a crop: a CPU takes longer to hand out a thousand small kernels one by one than a large
+    GPU to run them."""
+
+    WARM = 3
+
+    def __init__(self, run):
+        self.run, self.shape, self.warm = run, None, 0
+
+    def __call__(self, *inputs) -> tuple[torch.Tensor, torch.Tensor]:
+        if inputs[0].shape != self.shape:
+            self.shape, self.warm, self.graph = inputs[0].shape, 0, None
+        self.warm += 1
+        if self.warm <= self.WARM:  # Compiles and chooses kernels, on a stream of its own as a capture will be.
+            beside, here = torch.cuda.Stream(), torch.cuda.current_stream()
+            beside.wait_stream(here)
+            with torch.cuda.stream(beside):
+                done = self.run.update(*inputs)
+            here.wait_stream(beside)
+            return done
+        if self.graph is None:  # A capture runs nothing.
+            self.held, self.graph = [given.clone() for given in inputs], torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self.graph):
+                self.done = self.run.update(*self.held)
+        for held, given in zip(self.held, inputs):
+            held.copy_(given)
+        self.graph.replay()
+        return tuple(value.clone() for value in self.done)
 
 
 class Run:
@@ -120,6 +164,10 @@ class Run:
             ],
             fused=True,
         )
+        self.replayed = Replayed(self) if description.get("graph") and self.device.type == "cuda" else None
+        if self.replayed:  # Rates that a graph reads when it runs.
+            for group in self.optimizer.param_groups:
+                group |= {"lr": torch.tensor(0.0), "capturable": True}
         # Fuses what lies between the convolutions: cost volume, normalisation, warp. A crop's size is compiled in.
         self.forward = torch.compile(self.network, dynamic=False) if description["compile"] else self.network
         if self.device.type == "cuda":
@@ -150,14 +198,24 @@ class Run:
         return levels(batch, self.description.get("darkest", DARKEST), self.description.get("towards_bright", 1.0))
 
     def train_step(self, older, newer, truth) -> tuple[torch.Tensor, torch.Tensor]:
-        """One update; the loss and the end-point error of level 2, left where they were computed: reading a number
+        """One step; the loss and the end-point error of level 2, left where they were computed: reading a number
         makes the CPU wait for the GPU."""
         for group in self.optimizer.param_groups:
-            group["lr"] = self.rate() * group["factor"]
+            rate = self.rate() * group["factor"]
+            group["lr"] = group["lr"].fill_(rate) if self.replayed else rate
         older, newer = (f.contiguous(memory_format=self.layout) for f in (older, newer))
+        loss, error = (self.replayed or self.update)(older, newer, truth)
+        self.step += 1
+        decay = min(self.description["mean_decay"], self.step / (self.step + 10))
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.mean.parameters()), list(self.network.parameters()), 1 - decay)
+        return loss, error
+
+    def update(self, older, newer, truth) -> tuple[torch.Tensor, torch.Tensor]:
+        """Forward, backward and the optimizer's step: everything of a step that reads no number of the CPU's."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.description["bf16"]):
             flows, expected = self.forward(older, newer)
-        loss, likelihood, error = loss_of(self.network, flows, expected, truth)
+        loss, likelihood, error = loss_of(self.network, flows, expected, truth, self.description.get("pixels", False))
         self.optimizer.zero_grad(set_to_none=True)
         (loss + 0.1 * likelihood).backward()
         average_gradients(self.network)
@@ -165,10 +223,6 @@ class Run:
         # A step whose gradient is not finite is left out by the fused optimizer itself, without waiting for the device.
         self.optimizer.found_inf = (~norm.isfinite()).float()
         self.optimizer.step()
-        self.step += 1
-        decay = min(self.description["mean_decay"], self.step / (self.step + 10))
-        with torch.no_grad():
-            torch._foreach_lerp_(list(self.mean.parameters()), list(self.network.parameters()), 1 - decay)
         return loss.detach(), error
 
     def save(self, folder: Path) -> None:

@@ -6,11 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 import torch.distributed as dist
+import torch.nn.functional as F
 
 import checkpoints
+from networks import PwcNet
 from pairs import HeldOut, batch_of
 from scenes import Textures
-from train import Run, agreed, average_gradients, judged, leg, main
+from train import Run, agreed, average_gradients, judged, leg, loss_of, main
 
 DESCRIPTION = {
     "seed": 1, "network": "pwcnet", "clean": False, "peak_rate": 6e-4, "warm_up_steps": 5, "weight_decay": 1e-4, "clip": 1.0,
@@ -107,7 +109,7 @@ def test_every_description_makes_a_run(description):
     known = tomllib.loads(description.read_text())
     leg = {"start"} if description.stem.endswith("_leg") else set()
     own = {"pwcnet": {"start"}, "raftsmall": {"iterations", "start"}}.get(known["network"], {"width"} | leg)
-    extra = {"darkest", "towards_bright", "displacements", "recipe", "bank", "shapes", "apart", "ahead", "only"}
+    extra = {"darkest", "towards_bright", "displacements", "recipe", "bank", "shapes", "apart", "ahead", "only", "pixels", "graph"}
     assert set(known) - extra == set(DESCRIPTION) | own, "the same keys as every run"
     known.pop("start", None)
     run = Run(known)
@@ -235,3 +237,18 @@ def worker(rank: int, meeting: str) -> None:
 
 def test_two_workers_agree(tmp_path):
     torch.multiprocessing.spawn(worker, (f"file://{tmp_path}/meeting",), nprocs=2)
+
+
+def test_a_flow_may_be_judged_at_every_pixel():
+    truth = torch.zeros(1, 2, 64, 64)
+    truth[:, 0, :, 30:] = 8.0
+    cells = F.avg_pool2d(truth, 4)
+    one_side = cells.clone()
+    one_side[:, 0, :, 7] = 8.0
+    flows = lambda last: [torch.zeros(1, 2, 64 // 2**level, 64 // 2**level) for level in (5, 4, 3, 3)] + [last / 4]
+    expected = torch.ones(1, 1, 16, 16)
+    last = lambda flow, pixels: loss_of(PwcNet, flows(flow), expected, truth, pixels)[2].item()
+    assert last(cells, False) < 2e-3 < last(one_side, False), "the mean over the cell is what is asked"
+    # Between cells the flow is bilinear: 8 px on one side of column 30 and none on the other can't be told exactly.
+    off = (F.interpolate(one_side, scale_factor=4, mode="bilinear") - truth).norm(dim=1).mean().item()
+    assert last(one_side, True) == pytest.approx(off, abs=2e-3)
