@@ -32,6 +32,27 @@ pub struct Unfit {
     found: String,
 }
 
+/// Whether parts of so many rows and columns have the channels that go into so many layers, and whether there is room for what
+/// comes out of the last one and, if that is wanted, of the one before.
+pub fn fits(
+    [inputs, layers]: [usize; 2],
+    [outputs, kept]: [usize; 2],
+    parts: Parts<'_>,
+    [height, width]: [usize; 2],
+    last: usize,
+    before: Option<&[f32]>,
+) -> Result<(), Unfit> {
+    let cells = height * width;
+    let sum: usize = parts.iter().map(|part| part.len()).sum();
+    let whole = parts.iter().all(|part| cells > 0 && part.len() % cells == 0) && sum == inputs * cells;
+    let fits = before.is_none_or(|before| layers > 1 && before.len() == kept * cells);
+    if whole && fits && last == outputs * cells {
+        return Ok(());
+    }
+    let found = format!("{sum}, {last} and {:?}", before.map(|before| before.len()));
+    Err(Unfit { height, width, inputs, outputs, found })
+}
+
 impl Chain {
     /// Layers that keep the size, each with as many inputs as the one before has outputs; at least one.
     pub fn new(unit: Unit, layers: Vec<Layer>) -> Self {
@@ -54,16 +75,10 @@ impl Chain {
         before: Option<&mut [f32]>,
         spread: &impl Spread<E>,
     ) -> Result<(), E> {
-        let (unit, cells) = (self.unit, height * width);
+        let unit = self.unit;
         let inputs = self.layers.first().map_or(0, Layer::inputs);
-        let [outputs, kept] = self.outputs();
-        let sum: usize = parts.iter().map(|part| part.len()).sum();
-        let whole = parts.iter().all(|part| cells > 0 && part.len() % cells == 0) && sum == inputs * cells;
-        let fits = before.as_ref().is_none_or(|before| self.layers.len() > 1 && before.len() == kept * cells);
-        if !whole || last.len() != outputs * cells || !fits {
-            let found = format!("{sum}, {} and {:?}", last.len(), before.map(|before| before.len()));
-            return Err(Unfit { height, width, inputs, outputs, found }.into());
-        }
+        fits([inputs, self.layers.len()], self.outputs(), parts, [height, width], last.len(), before.as_deref())?;
+        let cells = height * width;
         for (layer, map) in self.layers.iter().zip(&mut self.maps) {
             map.resize([layer.inputs(), height, width], layer.margin());
         }

@@ -7,7 +7,7 @@
 //! in and comes out are planes of f32, as ONNX has them. Every result is computed by one thread in a fixed order, so that it
 //! does not depend on how many threads there are.
 
-mod chain;
+pub(super) mod chain;
 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
 mod dots;
 mod encoder;

@@ -30,12 +30,6 @@ impl From<chain::Unfit> for Error {
     }
 }
 
-impl From<winograd::Unfit> for Error {
-    fn from(unfit: winograd::Unfit) -> Self {
-        Error::new(unfit.to_string())
-    }
-}
-
 impl From<encoder::Unfit> for Error {
     fn from(unfit: encoder::Unfit) -> Self {
         Error::new(unfit.to_string())

@@ -7,7 +7,13 @@ use super::{
     layer::{Convolve, Layer},
     pixels::{LINE, Pack, Pixels, Unpack, skipped},
 };
-use crate::flow::{bands::Bands, convolutions::Spread};
+use crate::flow::{
+    bands::Bands,
+    convolutions::{
+        Spread,
+        chain::{Parts, Unfit, fits},
+    },
+};
 
 /// The operator `nightflow::Convolutions` in 32 bits with its memory, which is taken at the first call of a size.
 #[derive(Debug)]
@@ -48,17 +54,6 @@ impl Own {
     }
 }
 
-/// What does not fit.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("convolutions of {height} × {width}, {inputs} channels to {outputs}, can't have {found} values in and out")]
-pub struct Unfit {
-    height: usize,
-    width: usize,
-    inputs: usize,
-    outputs: usize,
-    found: String,
-}
-
 impl Chain {
     /// Layers for this unit, each with as many inputs as the one before has outputs; at least one.
     pub fn new(unit: Unit, layers: Vec<Layer>) -> Self {
@@ -76,23 +71,15 @@ impl Chain {
     /// layer before the last gives, if that is wanted.
     pub fn run<E: From<Unfit>>(
         &mut self,
-        parts: &[&[f32]],
+        parts: Parts<'_>,
         size: [usize; 2],
         last: &mut [f32],
         before: Option<&mut [f32]>,
         spread: &impl Spread<E>,
     ) -> Result<(), E> {
-        let [height, width] = size;
-        let cells = height * width;
+        let [height, _] = size;
         let inputs = self.layers.first().map_or(0, Layer::inputs);
-        let [outputs, kept] = self.outputs();
-        let sum: usize = parts.iter().map(|part| part.len()).sum();
-        let whole = parts.iter().all(|part| cells > 0 && part.len() % cells == 0) && sum == inputs * cells;
-        let fits = before.as_ref().is_none_or(|before| self.layers.len() > 1 && before.len() == kept * cells);
-        if !whole || last.len() != outputs * cells || !fits {
-            let found = format!("{sum}, {} and {:?}", last.len(), before.map(|before| before.len()));
-            return Err(Unfit { height, width, inputs, outputs, found }.into());
-        }
+        fits([inputs, self.layers.len()], self.outputs(), parts, size, last.len(), before.as_deref())?;
         self.resize(size);
         let Self { unit, layers, maps, own } = self;
         let (unit, count) = (*unit, layers.len());

@@ -14,7 +14,7 @@ mod product;
 #[cfg(test)]
 mod tests;
 
-pub use chain::{Chain, Unfit};
+pub use chain::Chain;
 pub use layer::Layer;
 
 pub use crate::flow::lanes::Unit;

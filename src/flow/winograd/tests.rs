@@ -6,13 +6,7 @@ use proptest::prelude::*;
 use rayon::prelude::*;
 
 use super::*;
-use crate::flow::cost_volume::tests::noise;
-
-impl From<Unfit> for Infallible {
-    fn from(unfit: Unfit) -> Self {
-        panic!("{unfit}")
-    }
-}
+use crate::flow::{convolutions::chain::Unfit, cost_volume::tests::noise};
 
 /// Every band on one thread, and backwards, which must not matter.
 fn backwards(count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<(), Infallible> {
