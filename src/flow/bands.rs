@@ -43,6 +43,43 @@ impl<'a, T> Bands<'a, T> {
     }
 }
 
+impl<T> Bands<'_, T> {
+    /// The first band that nobody has, until who gets it lets go of it. Who is done with one soon finds it free again, with what is
+    /// in the caches; [`Bands::take`] must not be used besides.
+    pub fn lend(&self) -> Option<Lent<'_, T>> {
+        loop {
+            // Sees all that whoever let go of the band wrote to it.
+            let taken = self.taken.load(Ordering::Acquire);
+            let number = taken.trailing_ones();
+            let first = (number as usize).checked_mul(self.rows).filter(|first| *first < self.height)?;
+            let (bit, order) = (1u64.checked_shl(number)?, Ordering::Acquire);
+            if self.taken.compare_exchange_weak(taken, taken | bit, order, Ordering::Relaxed).is_ok() {
+                let band = Band { bands: self, first, end: (first + self.rows).min(self.height) };
+                return Some(Lent { band, bit });
+            }
+        }
+    }
+}
+
+/// A band that is given back when this goes.
+pub struct Lent<'a, T> {
+    band: Band<'a, T>,
+    bit: u64,
+}
+
+impl<T> Lent<'_, T> {
+    /// The band's first row of the first plane.
+    pub fn row(&mut self) -> &mut [T] {
+        self.band.row(0, self.band.first)
+    }
+}
+
+impl<T> Drop for Lent<'_, T> {
+    fn drop(&mut self) {
+        self.band.bands.taken.fetch_and(!self.bit, Ordering::Release);
+    }
+}
+
 /// Some rows of every plane.
 pub struct Band<'a, T> {
     bands: &'a Bands<'a, T>,
@@ -83,5 +120,32 @@ mod tests {
         assert!(bands.take(3).is_none() && bands.take(usize::MAX).is_none());
         assert_eq!(memory[..15], [0.0; 15]);
         assert_eq!(memory[15..], [0., 0., 0., 1., 1., 1., 2., 2., 2., 3., 3., 3., 4., 4., 4.]);
+    }
+
+    #[test]
+    fn what_is_lent_comes_back() {
+        let mut memory = vec![0; 3 * 4];
+        let bands = Bands::new(&mut memory, [1, 3, 4], 1);
+        let (mut one, mut two) = (bands.lend().unwrap(), bands.lend().unwrap());
+        one.row().fill(1);
+        two.row().fill(2);
+        drop(one);
+        let (mut again, third) = (bands.lend().unwrap(), bands.lend().unwrap());
+        assert_eq!(again.row(), [1; 4]);
+        assert!(bands.lend().is_none());
+        drop((again, third, two));
+        std::thread::scope(|scope| {
+            for _ in 0..3 {
+                scope.spawn(|| {
+                    (0..2000).for_each(|_| {
+                        let mut band = bands.lend().unwrap();
+                        let before = band.row()[0];
+                        band.row().fill(before + 1);
+                    });
+                });
+            }
+        });
+        assert_eq!(memory.chunks(4).map(|row| row[0]).sum::<i32>(), 3 + 6000);
+        assert!(memory.chunks(4).all(|row| row == [row[0]; 4]));
     }
 }

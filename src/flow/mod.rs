@@ -14,6 +14,7 @@ mod matcher;
 mod network;
 mod onnx;
 mod onnx_graph;
+mod onnx_shared;
 mod operators;
 pub mod padding;
 pub mod profile;

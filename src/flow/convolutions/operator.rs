@@ -10,6 +10,7 @@ use ort::{
 
 use super::{CONVOLUTIONS, Chain, Encoder, Layer, Step, Unit, Weights, chain, encoder};
 use crate::flow::{
+    onnx_shared,
     operators::{input, output, spread},
     winograd,
 };
@@ -132,7 +133,9 @@ impl Operator for Convolutions {
                 (16, _) => narrow.push(Layer::new(&weights, shape, &bias, Step { stride: [1; 2], dilation, slope })),
                 (32, [outputs, inputs, 3, 3]) => {
                     let unit = winograd::Unit::best();
-                    wide.push(winograd::Layer::new(unit, &weights, [outputs, inputs], &bias, dilation, slope));
+                    let mut layer = winograd::Layer::new(unit, &weights, [outputs, inputs], &bias, dilation, slope);
+                    layer.share(onnx_shared::first);
+                    wide.push(layer);
                 }
                 _ => {
                     let found = format!("layer {number} has {bits} and {shape:?}");

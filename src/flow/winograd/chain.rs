@@ -1,7 +1,5 @@
 //! Convolutions one after the other, from planes to planes.
 
-use std::sync::{Mutex, TryLockError};
-
 use super::{
     Unit,
     layer::{Convolve, Layer},
@@ -25,32 +23,26 @@ pub struct Chain {
     own: Own,
 }
 
-/// What bands need for themselves, one piece for each, of which every thread keeps to the first that it finds free: so it stays
-/// in the caches, and what is never needed is never touched.
+/// What bands need for themselves: one piece for each, of which only those are touched that are in use at the same time.
 #[derive(Debug, Default)]
 struct Own {
-    pieces: Vec<Mutex<Vec<f32>>>,
+    values: Vec<f32>,
+    pieces: usize,
     each: usize,
 }
 
 impl Own {
-    fn resize(&mut self, bands: usize, each: usize) {
-        if bands > self.pieces.len() || each > self.each {
-            self.each = each.max(self.each);
-            self.pieces = (0..bands.max(self.pieces.len())).map(|_| Mutex::new(vec![0.0; self.each + LINE])).collect();
+    fn resize(&mut self, pieces: usize, each: usize) {
+        if pieces > self.pieces || each > self.each {
+            (self.pieces, self.each) = (pieces.max(self.pieces), each.max(self.each).next_multiple_of(LINE));
+            // New zeros take no memory before they are touched.
+            self.values = vec![0.0; self.pieces * self.each + LINE];
         }
     }
 
-    /// Nobody ever waits: there is a piece for each band.
-    fn with(&self, work: impl FnOnce(&mut [f32])) {
-        let free = self.pieces.iter().find_map(|piece| match piece.try_lock() {
-            Ok(piece) => Some(piece),
-            Err(TryLockError::Poisoned(piece)) => Some(piece.into_inner()),
-            Err(TryLockError::WouldBlock) => None,
-        });
-        let Some(mut piece) = free else { return work(&mut vec![0.0; self.each]) };
-        let skipped = skipped(&piece);
-        work(&mut piece[skipped..]);
+    fn cut(&mut self) -> Bands<'_, f32> {
+        let first = skipped(&self.values);
+        Bands::new(&mut self.values[first..], [1, self.pieces, self.each], 1)
     }
 }
 
@@ -123,16 +115,16 @@ fn convolve<E>(
     layer: &Layer,
     from: &Pixels,
     to: &mut Pixels,
-    own: &Own,
+    own: &mut Own,
     spread: &impl Spread<E>,
 ) -> Result<(), E> {
     let [_, height, width] = from.shape;
     let rows = layer.band([height, width]);
     let (before, depth, bands) = (to.margins[0], to.depth(), height.div_ceil(rows));
-    let to = to.cut(rows);
+    let (to, own) = (to.cut(rows), own.cut());
     spread(bands, &|number| {
-        if let Some(to) = to.take(number) {
-            own.with(|scratch| unit.run(Convolve { layer, from, before, depth, scratch, to }));
+        if let (Some(to), Some(mut own)) = (to.take(number), own.lend()) {
+            unit.run(Convolve { layer, from, before, depth, scratch: own.row(), to });
         }
     })
 }

@@ -1,6 +1,6 @@
 //! One convolution: its weights as the products want them, and its pass over a map.
 
-use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::sync::Arc;
 
 use super::{
     Unit,
@@ -61,7 +61,12 @@ impl Layer {
         whole[..outputs].copy_from_slice(bias);
         let mut packed = vec![0.0; PLACES * inputs * whole.len()];
         unit.run(Prepare { weights, inputs, outputs, to: &mut packed });
-        Self { inputs, outputs, dilation, slope, weights: shared(&packed), bias: whole }
+        Self { inputs, outputs, dilation, slope, weights: aligned(&packed), bias: whole }
+    }
+
+    /// Exchanges the weights for what `known` has instead, which must be equal.
+    pub fn share(&mut self, known: impl FnOnce(Arc<[f32]>) -> Arc<[f32]>) {
+        self.weights = known(self.weights.clone());
     }
 
     /// Channels that go in.
@@ -111,23 +116,20 @@ impl Layer {
     }
 }
 
-/// The same memory for the same weights: a decoder that looks several times is several nodes of a graph. Where they begin,
-/// [`skipped`] says.
-fn shared(weights: &[f32]) -> Arc<[f32]> {
-    static KNOWN: Mutex<Vec<Weak<[f32]>>> = Mutex::new(vec![]);
-    let mut known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
-    known.retain(|weights| weights.strong_count() > 0);
-    let same = |found: &Arc<[f32]>| found[skipped(found)..].starts_with(weights) && found.len() == weights.len() + LINE;
-    if let Some(found) = known.iter().filter_map(Weak::upgrade).find(same) {
-        return found;
-    }
+/// Memory that begins a cache line where [`skipped`] says.
+fn aligned(weights: &[f32]) -> Arc<[f32]> {
     let mut new: Arc<[f32]> = vec![0.0; weights.len() + LINE].into();
     let first = skipped(&new);
     if let Some(to) = Arc::get_mut(&mut new) {
         to[first..][..weights.len()].copy_from_slice(weights);
     }
-    known.push(Arc::downgrade(&new));
     new
+}
+
+/// Whether two layers' weights are equal, wherever their cache lines begin.
+pub fn are_equal(one: &[f32], other: &[f32]) -> bool {
+    let of = |weights: &[f32]| skipped(weights)..skipped(weights) + weights.len().saturating_sub(LINE);
+    one.len() == other.len() && one[of(one)] == other[of(other)]
 }
 
 /// Values of one place of so many tiles: a line more than there are, so that places don't drive each other out of the cache.

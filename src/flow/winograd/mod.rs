@@ -15,6 +15,6 @@ mod product;
 mod tests;
 
 pub use chain::Chain;
-pub use layer::Layer;
+pub use layer::{Layer, are_equal};
 
 pub use crate::flow::lanes::Unit;
