@@ -103,6 +103,8 @@ impl<T> Band<'_, T> {
 
 #[cfg(test)]
 mod tests {
+    use rayon::prelude::*;
+
     use super::*;
 
     #[test]
@@ -134,16 +136,10 @@ mod tests {
         assert_eq!(again.row(), [1; 4]);
         assert!(bands.lend().is_none());
         drop((again, third, two));
-        std::thread::scope(|scope| {
-            for _ in 0..3 {
-                scope.spawn(|| {
-                    (0..2000).for_each(|_| {
-                        let mut band = bands.lend().unwrap();
-                        let before = band.row()[0];
-                        band.row().fill(before + 1);
-                    });
-                });
-            }
+        (0..6000).into_par_iter().for_each(|_| {
+            let mut band = bands.lend().unwrap();
+            let before = band.row()[0];
+            band.row().fill(before + 1);
         });
         assert_eq!(memory.chunks(4).map(|row| row[0]).sum::<i32>(), 3 + 6000);
         assert!(memory.chunks(4).all(|row| row == [row[0]; 4]));

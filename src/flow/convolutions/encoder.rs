@@ -286,7 +286,6 @@ impl Encoder {
         let (unit, margin) = (self.unit, self.image.margin);
         let (_, bands) = Map::bands(height);
         let stride = half + 2 * BESIDE;
-        // Zeros beside the rows are never written to.
         self.columns.resize(bands * 2 * COLOURS * stride, 0.0);
         let own = Bands::new(&mut self.columns, [1, bands, 2 * COLOURS * stride], 1);
         let to = self.image.cut();
@@ -317,6 +316,11 @@ impl Work for Look<'_> {
         let Self { image, height, width, number, margin, .. } = self;
         let (half, columns) = (width / 2, self.own.row(0, number));
         let stride = half + 2 * BESIDE;
+        // Images of another size may have been here.
+        for row in columns.chunks_exact_mut(stride) {
+            row[..BESIDE].fill(0.0);
+            row[BESIDE + half..].fill(0.0);
+        }
         for y in self.to.first..self.to.end {
             // Even and odd columns of each colour apart: what was every second number is then side by side.
             for (c, two) in columns.chunks_exact_mut(2 * stride).enumerate() {

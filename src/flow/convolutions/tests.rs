@@ -252,6 +252,13 @@ fn the_encoder_is_raft_smalls() {
         let [c, d] = &mut again;
         let Ok(()) = encoder.run::<Infallible>(&image, [height, width], c, d, &shared);
         assert_eq!(found, again);
+        // Nor does it matter what was looked at before.
+        let wider = noise(5, 3 * 64 * 96);
+        let (mut of_wider, mut of_eighth) = (vec![0.0; 64 * 16 * 24], vec![0.0; 40 * 8 * 12]);
+        let Ok(()) = encoder.run::<Infallible>(&wider, [64, 96], &mut of_wider, &mut of_eighth, &shared);
+        let [a, b] = &mut again;
+        let Ok(()) = encoder.run::<Infallible>(&image, [height, width], a, b, &backwards);
+        assert_eq!(found, again);
         let (one, other) = (apart(&found[0], &quarter.values), apart(&found[1], &eighth.values));
         assert!(one < 0.01 && other < 0.02, "{unit:?}: {one}, {other}");
     }

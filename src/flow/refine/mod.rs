@@ -14,7 +14,7 @@
 //!   largest window believes the network. Errors of a network are alike over many cells, and many cells know what one
 //!   does not.
 //! - Two rounds, each at the place that the one before found. A cell whose frames are no more alike after the first round
-//!   than before keeps the network's vector, and so does one that has left the frame.
+//!   than before keeps the network's vector.
 
 mod pyramid;
 mod sums;
@@ -163,12 +163,7 @@ impl Refiner {
             let vectors = vectors.as_chunks_mut::<2>().0[..width].iter_mut();
             for (column, (vector, error)) in vectors.zip(errors).enumerate() {
                 let cell = row * width + column;
-                // What has left the frame can't be compared with anything: what lies around it is another thing's texture.
-                let gone =
-                    [(column, width, self.start[2 * cell]), (row, height, self.start[2 * cell + 1])].into_iter().any(
-                        |(at, length, moved)| !(0.0..length as f32).contains(&(at as f32 + 0.5 + moved / CELL as f32)),
-                    );
-                if gone || self.before[cell] < 0.0 || self.variance[cell] <= 0.0 {
+                if self.before[cell] < 0.0 || self.variance[cell] <= 0.0 {
                     continue;
                 }
                 vector[0] += self.change[2 * cell] * scale[0];
