@@ -164,7 +164,7 @@ pub const REASONS: &[(&str, &str)] = &[
     ("provider", "cpu: the library that the build fetches has no other; models/README.md says what others bring"),
     (
         "precision",
-        "fp32: what every processor has, and what the golden output was noted with; bf16 is faster on processors with AMX or with bf16 in AVX-512, which nightflow doctor names",
+        "fp32: what every processor has, and what the golden output was noted with; bf16 is faster on processors with AMX, which nightflow doctor names, and runs on those with bf16 in AVX-512",
     ),
     (
         "resolution",
