@@ -229,10 +229,10 @@ fn finished<L: Lanes>(lanes: L, [a, b, c, d]: [L::V; IN]) -> [L::V; OUT] {
     [lanes.add(lanes.add(a, b), c), lanes.sub(lanes.sub(b, c), d)]
 }
 
-/// The columns of a square of vectors.
+/// Columns as rows.
 #[inline(always)]
-fn turned<V: Copy, const R: usize>(rows: [[V; IN]; R]) -> [[V; R]; IN] {
-    let mut columns = [[rows[0][0]; R]; IN];
+fn turned<V: Copy, const R: usize, const C: usize>(rows: [[V; C]; R]) -> [[V; R]; C] {
+    let mut columns = [[rows[0][0]; R]; C];
     for (i, row) in rows.iter().enumerate() {
         for (j, value) in row.iter().enumerate() {
             columns[j][i] = *value;
@@ -282,9 +282,8 @@ impl Convolve<'_> {
                 *row = finished(lanes, values);
             }
             let bias = lanes.load(&bias[c..]);
-            for j in 0..OUT {
-                let column = finished(lanes, [rows[0][j], rows[1][j], rows[2][j], rows[3][j]]);
-                for (i, value) in column.into_iter().enumerate() {
+            for (j, column) in turned(rows).into_iter().enumerate() {
+                for (i, value) in finished(lanes, column).into_iter().enumerate() {
                     let (y, x) = (y + i * dilation, x + j * dilation);
                     if y < self.to.end && x < width {
                         let value = lanes.add(value, bias);
