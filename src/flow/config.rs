@@ -82,7 +82,7 @@ pub struct Config {
     pub threads: usize,
     /// Cores that these threads are kept on, one each; empty: wherever there is room.
     pub cores: Vec<usize>,
-    /// What computes the cost volumes; plain where the network has no fused graph, and for providers other than `cpu`.
+    /// What computes cost volumes and convolutions; plain where the network has no fused graph, and for providers other than `cpu`.
     pub operators: Operators,
     /// What computes the graphs.
     pub provider: Provider,

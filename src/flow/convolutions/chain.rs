@@ -32,6 +32,12 @@ pub struct Unfit {
     found: String,
 }
 
+/// Of the channels that layers give those of the last and of the one before.
+pub fn last_two(outputs: impl DoubleEndedIterator<Item = usize>) -> [usize; 2] {
+    let mut back = outputs.rev();
+    [back.next().unwrap_or(0), back.next().unwrap_or(0)]
+}
+
 /// Whether parts of so many rows and columns have the channels that go into so many layers, and whether there is room for what
 /// comes out of the last one and, if that is wanted, of the one before.
 pub fn fits(
@@ -62,8 +68,7 @@ impl Chain {
 
     /// Channels that come out, and those of the layer before the last.
     pub fn outputs(&self) -> [usize; 2] {
-        let mut back = self.layers.iter().rev().map(Layer::outputs);
-        [back.next().unwrap_or(0), back.next().unwrap_or(0)]
+        last_two(self.layers.iter().map(Layer::outputs))
     }
 
     /// Computes everything, `before` being what the layer before the last gives, if that is wanted.

@@ -16,7 +16,7 @@ mod map;
 mod operator;
 mod rows;
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;
 mod tiles;
 
 pub use chain::Chain;

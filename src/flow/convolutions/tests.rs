@@ -92,13 +92,13 @@ impl Planes {
 }
 
 /// Every band on one thread, and backwards, which must not matter.
-fn backwards(count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<(), Infallible> {
+pub fn backwards(count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<(), Infallible> {
     (0..count).rev().for_each(work);
     Ok(())
 }
 
 /// On as many threads as there are.
-fn shared(count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<(), Infallible> {
+pub fn shared(count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<(), Infallible> {
     (0..count).into_par_iter().for_each(work);
     Ok(())
 }

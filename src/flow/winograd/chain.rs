@@ -9,7 +9,7 @@ use crate::flow::{
     bands::Bands,
     convolutions::{
         Spread,
-        chain::{Parts, Unfit, fits},
+        chain::{Parts, Unfit, fits, last_two},
     },
 };
 
@@ -55,8 +55,7 @@ impl Chain {
 
     /// Channels that come out, and those of the layer before the last.
     pub fn outputs(&self) -> [usize; 2] {
-        let mut back = self.layers.iter().rev().map(Layer::outputs);
-        [back.next().unwrap_or(0), back.next().unwrap_or(0)]
+        last_two(self.layers.iter().map(Layer::outputs))
     }
 
     /// Computes everything: `parts` are planes that are read as if they were one tensor after the other, `before` is what the

@@ -1,24 +1,15 @@
 //! The operator against convolutions as they are defined, in 64 bits.
 
-use std::convert::Infallible;
-
 use proptest::prelude::*;
-use rayon::prelude::*;
 
 use super::*;
-use crate::flow::{convolutions::chain::Unfit, cost_volume::tests::noise};
-
-/// Every band on one thread, and backwards, which must not matter.
-fn backwards(count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<(), Infallible> {
-    (0..count).rev().for_each(work);
-    Ok(())
-}
-
-/// On as many threads as there are.
-fn shared(count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<(), Infallible> {
-    (0..count).into_par_iter().for_each(work);
-    Ok(())
-}
+use crate::flow::{
+    convolutions::{
+        chain::Unfit,
+        tests::{backwards, shared},
+    },
+    cost_volume::tests::noise,
+};
 
 /// A convolution of 3 × 3 with zeros around, and its activation.
 fn convolved(
