@@ -110,9 +110,10 @@ impl Default for Stopwatch {
 }
 
 impl Stopwatch {
-    /// Starts a step: what came before belongs to no stage.
-    pub fn start(&mut self) {
-        self.last = Instant::now();
+    /// Starts a step: what came before belongs to no stage, but for the work that was done for it already.
+    pub fn start(&mut self, ahead: Duration) {
+        let now = Instant::now();
+        self.last = now.checked_sub(ahead).unwrap_or(now);
     }
 
     /// The kept durations of a stage in milliseconds.

@@ -1,26 +1,30 @@
 //! The loop: source, step, sinks; with stop, counters and the status once a second.
 
+mod ahead;
 mod governor;
 
 use std::{
     collections::BTreeMap,
     sync::{
-        Arc,
         atomic::{AtomicBool, Ordering},
+        mpsc::{self, Receiver, SyncSender},
     },
+    thread,
     time::{Duration, Instant},
 };
 
 use crate::{
-    camera::{self, Counts, Next, Sample, Source},
+    camera::{self, Counts, Sample},
     clock::{self, Laps, Reservoir, Stage, Stopwatch},
-    exposure::Noise,
+    exposure::{Exposed, Linear, Noise},
     flow::{Flow, Lender, Own, State},
     motion::{Diagnosis, NoSight, Scale, Sector},
-    pipeline::{Outcome, Pipeline},
+    pipeline::{Back, Outcome, Pipeline, Read},
     publish::{self, Moved, Offer, Sink, iceoryx2::SharedSink},
     wire,
 };
+pub use ahead::Open;
+use ahead::{Ahead, Passed, Reopening, Told, What};
 pub use governor::{Governor, Narrowed, Taken};
 
 /// How long the loop waits for a sample before it looks at the stop flag again.
@@ -39,6 +43,9 @@ pub enum Error {
     /// A sink could not write out what it kept.
     #[error(transparent)]
     Publish(#[from] publish::Error),
+    /// There is no thread for the source.
+    #[error("can't start a thread for the source: {0}")]
+    Thread(std::io::Error),
 }
 
 /// Where results go: shared memory lends the network its memory, all others look at it.
@@ -66,13 +73,13 @@ impl Outputs<'_> {
     }
 
     /// Every sink looks at the lent memory first, because sending it gives it away.
-    fn offer(&mut self, moved: &Moved, pipeline: &Pipeline) {
+    fn offer(&mut self, moved: &Moved, image: Option<&Exposed>) {
         let (vectors, confidence) = match &self.shared {
             Some(shared) => shared.lent(),
             None => self.own.lent(),
         };
         let flow = Flow { older: moved.older, newer: moved.newer, grid: moved.grid, vectors, confidence };
-        if let Some(image) = pipeline.image() {
+        if let Some(image) = image {
             let offer = Offer { moved, flow, image };
             for sink in &mut self.sinks {
                 said(sink.offer(&offer));
@@ -261,141 +268,124 @@ impl Cadence {
     }
 }
 
-/// A source that is opened again when it is lost.
-struct Reopening<'a> {
-    open: &'a mut dyn FnMut() -> Result<Box<dyn Source>, camera::Error>,
-    source: Option<Box<dyn Source>>,
-    pause: Duration,
-    before: Counts,
-}
-
-impl Reopening<'_> {
-    /// The next sample; a lost source is one warning and a growing pause, then another try.
-    fn next(&mut self, stop: &AtomicBool) -> Result<Next, camera::Error> {
-        let source = match &mut self.source {
-            Some(source) => source,
-            None => self.source.insert((self.open)()?),
-        };
-        match source.next(WAIT) {
-            Err(error @ camera::Error::Lost { .. }) => {
-                tracing::warn!(target: "nightflow::camera", "{error}; trying again in {:?}", self.pause);
-                self.before = self.counts();
-                self.source = None;
-                let until = clock::instant() + self.pause;
-                while clock::instant() < until && !stop.load(Ordering::Relaxed) {
-                    std::thread::sleep(WAIT);
-                }
-                self.pause = (self.pause * 2).min(BACK_OFF[1]);
-                Ok(Next::Idle)
-            }
-            Ok(Next::Sample(sample)) => {
-                self.pause = BACK_OFF[0];
-                Ok(Next::Sample(sample))
-            }
-            other => other,
-        }
-    }
-
-    fn counts(&self) -> Counts {
-        let now = self.source.as_ref().map(|source| source.counts()).unwrap_or_default();
-        Counts {
-            arrived: self.before.arrived + now.arrived,
-            displaced: self.before.displaced + now.displaced,
-            missed: self.before.missed + now.missed,
-            torn: self.before.torn + now.torn,
-            overrun: self.before.overrun + now.overrun,
-        }
-    }
-}
-
 /// Runs until the source ends or `stop` is set, then writes everything out. `look` sees the report after every sample,
 /// with the progress through a finite source. Without a pipeline the samples are only kept. A governor, where there is one,
 /// may narrow the images; what it decides is a sample like any other, so that it is recorded and replayed.
+///
+/// The source has a thread of its own, which reads each frame while the one before it is in the network.
 pub fn drive(
-    open: &mut dyn FnMut() -> Result<Box<dyn Source>, camera::Error>,
-    mut pipeline: Option<&mut Pipeline>,
+    open: &mut Open<'_>,
+    pipeline: Option<&mut Pipeline>,
     outputs: &mut Outputs<'_>,
     stop: &AtomicBool,
-    (silence, mut governor): (Duration, Option<Governor>),
+    (silence, governor): (Duration, Option<Governor>),
     look: &mut dyn FnMut(&Report, Option<f64>),
 ) -> Result<Report, Error> {
-    let mut report = Report::default();
-    let first = (open)()?;
-    let mut source = Reopening { open, source: Some(first), pause: BACK_OFF[0], before: Counts::default() };
-    let now = clock::instant();
-    let mut cadence = Cadence { last: now, last_frame: now, steps: 0, silence };
-    while !stop.load(Ordering::Relaxed) {
-        match source.next(stop) {
-            Ok(Next::Sample(sample)) => {
-                outputs.sample(&sample);
-                cadence.saw(&sample, &mut report);
-                if let Some(pipeline) = pipeline.as_deref_mut() {
-                    let taken = advance(&sample, pipeline, outputs, &mut report);
-                    if let (Some(governor), Some(taken)) = (&mut governor, taken) {
-                        govern(governor, taken, source.counts().displaced, pipeline, outputs, &mut report);
+    let source = Reopening::new(open)?;
+    let told = Told::default();
+    let (front, back) = pipeline.map(Pipeline::halves).unzip();
+    let (to, passed) = mpsc::sync_channel(ahead::ROOM);
+    let (back_to, spares) = mpsc::sync_channel(ahead::SPARES);
+    let ended = thread::scope(|scope| {
+        let ahead = Ahead { source, front, stop, told: &told, to, spares };
+        let named = thread::Builder::new().name("camera".into());
+        named.spawn_scoped(scope, || ahead.run()).map_err(Error::Thread)?;
+        let begin = clock::instant();
+        let cadence = Cadence { last: begin, last_frame: begin, steps: 0, silence };
+        Loop { back, outputs, governor, told: &told, spares: back_to, cadence, report: Report::default() }
+            .run(&passed, look)
+    });
+    let finished = outputs.finish();
+    if ended.is_err() {
+        said(finished);
+        return ended;
+    }
+    finished?;
+    ended.map(|report| Report { lost: outputs.lost(), ..report })
+}
+
+/// The loop, with what it works on.
+struct Loop<'a, 'b> {
+    back: Option<&'a mut Back>,
+    outputs: &'a mut Outputs<'b>,
+    governor: Option<Governor>,
+    told: &'a Told,
+    spares: SyncSender<Linear>,
+    cadence: Cadence,
+    report: Report,
+}
+
+impl Loop<'_, '_> {
+    /// Takes what is passed until nothing more comes.
+    fn run(mut self, passed: &Receiver<Passed>, look: &mut dyn FnMut(&Report, Option<f64>)) -> Result<Report, Error> {
+        while let Ok(Passed { what, counts, progress }) = passed.recv() {
+            self.report.source = counts;
+            match what {
+                What::Sample(sample, read, took) => {
+                    self.outputs.sample(&sample);
+                    self.cadence.saw(&sample, &mut self.report);
+                    if let Some(taken) = self.advance(&sample, read, took) {
+                        self.tell(&Taken { displaced: counts.displaced, ..taken });
                     }
                 }
+                What::Idle => {}
+                What::Failed(error @ (camera::Error::Torn { .. } | camera::Error::Wire(_))) => {
+                    self.report.spoil("camera", &error);
+                }
+                What::Failed(fatal) => return Err(fatal.into()),
             }
-            Ok(Next::Idle) => {}
-            Ok(Next::End) => break,
-            Err(error @ (camera::Error::Torn { .. } | camera::Error::Wire(_))) => report.spoil("camera", &error),
-            Err(fatal) => {
-                outputs.finish()?;
-                return Err(fatal.into());
+            self.status();
+            look(&self.report, progress);
+        }
+        Ok(self.report)
+    }
+
+    /// Says how it goes, once a second.
+    fn status(&mut self) {
+        if self.cadence.last.elapsed() >= STATUS {
+            self.report.lost = self.outputs.lost();
+            self.report.diagnosis = self.back.as_deref().and_then(Back::diagnosis);
+            self.outputs.status(&self.report.status(&self.cadence));
+            (self.cadence.last, self.cadence.steps) = (clock::instant(), self.report.steps);
+        }
+    }
+
+    /// Tells the thread before how long a step took and, if the governor says so, how wide images should be.
+    fn tell(&mut self, taken: &Taken) {
+        self.told.step_ns.store((taken.step_s * 1e9) as u64, Ordering::Relaxed);
+        if let Some(governor) = &mut self.governor {
+            if let Some(columns) = governor.took(taken) {
+                self.told.columns.store(columns, Ordering::Relaxed);
             }
+            self.report.narrowed = governor.narrowed();
         }
-        report.source = source.counts();
-        if cadence.last.elapsed() >= STATUS {
-            report.lost = outputs.lost();
-            report.diagnosis = pipeline.as_deref().and_then(Pipeline::diagnosis);
-            outputs.status(&report.status(&cadence));
-            cadence = Cadence { last: clock::instant(), steps: report.steps, ..cadence };
-        }
-        look(&report, source.source.as_ref().and_then(|source| source.progress()));
     }
-    let finished = outputs.finish();
-    report.lost = outputs.lost();
-    finished?;
-    Ok(report)
-}
 
-/// Lets the governor look at a step, and does what it says.
-fn govern(
-    governor: &mut Governor,
-    taken: Taken,
-    displaced: u64,
-    pipeline: &mut Pipeline,
-    outputs: &mut Outputs<'_>,
-    report: &mut Report,
-) {
-    if let Some(columns) = governor.took(&Taken { displaced, ..taken }) {
-        let header = wire::Header { stamp: taken.stamp.into(), frame_id: String::new() };
-        let sample = Sample::Width(Arc::new(wire::Width { header, columns: columns as u32 }));
-        outputs.sample(&sample);
-        advance(&sample, pipeline, outputs, report);
-        tracing::info!(target: "nightflow::node", "images are developed {columns} columns wide from here on");
-    }
-    report.narrowed = governor.narrowed();
-}
-
-/// One sample through the pipeline and out of every sink; how a step went, where it was one.
-fn advance(sample: &Sample, pipeline: &mut Pipeline, outputs: &mut Outputs<'_>, report: &mut Report) -> Option<Taken> {
-    let start = clock::instant();
-    report.watch.start();
-    match pipeline.step(sample, outputs.lender(), &mut report.watch) {
-        Ok(Outcome::Moved(moved)) => {
-            outputs.offer(&moved, pipeline);
-            report.watch.lap(Stage::Publish);
-            report.moved(&moved);
-            let step_s = start.elapsed().as_secs_f64();
-            report.step_ms.keep(step_s * 1e3);
-            report.latency_ms.keep(clock::now().seconds_since(moved.newer) * 1e3);
-            let size = pipeline.image().map_or([1, 1], |image| [image.width, image.height]);
-            return Some(Taken { stamp: moved.newer, displaced: 0, step_s, size });
+    /// One sample through the pipeline and out of every sink; how a step went, where it was one.
+    fn advance(&mut self, sample: &Sample, read: Read, took: Duration) -> Option<Taken> {
+        let Self { back, outputs, spares, report, .. } = self;
+        let back = back.as_deref_mut()?;
+        let start = clock::instant();
+        report.watch.start(took);
+        let mut spare = |linear| {
+            // There is room for all that are out. If the other thread has ended, nobody wants it.
+            let _ = spares.try_send(linear);
+        };
+        match back.step(sample, read, &mut spare, outputs.lender(), &mut report.watch) {
+            Ok(Outcome::Moved(moved)) => {
+                outputs.offer(&moved, back.image());
+                report.watch.lap(Stage::Publish);
+                report.moved(&moved);
+                let step = start.elapsed();
+                report.step_ms.keep((took + step).as_secs_f64() * 1e3);
+                report.latency_ms.keep(clock::now().seconds_since(moved.newer) * 1e3);
+                let size = back.image().map_or([1, 1], |image| [image.width, image.height]);
+                return Some(Taken { stamp: moved.newer, displaced: 0, step_s: step.as_secs_f64(), size });
+            }
+            Ok(Outcome::Unpaired) => report.unpaired += 1,
+            Ok(Outcome::Noted) => {}
+            Err(error) => report.spoil(error.cause(), &error),
         }
-        Ok(Outcome::Unpaired) => report.unpaired += 1,
-        Ok(Outcome::Noted) => {}
-        Err(error) => report.spoil(error.cause(), &error),
+        None
     }
-    None
 }

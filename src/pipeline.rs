@@ -6,22 +6,40 @@ use crate::{
     camera::{Frame, Sample},
     clock::{Laps, Stage, Stamp},
     config::Config,
-    exposure::{self, Developer, Exposed},
+    exposure::{self, Exposed, Linear, Linearizer, Pairing},
     flow::{self, Lender, Matcher, Resolution, State},
     motion::{self, Diagnosis, Lack, Lookout, NoSight, Odometer},
     publish::Moved,
 };
 
 /// The three stages between camera and sinks, and what they remember from one frame to the next.
+///
+/// It is cut where nothing is told backwards: [`Front`] reads each frame's bytes, [`Back`] does the rest. One after the other,
+/// as in [`Pipeline::step`], or beside each other, as in the node: if both see the same samples in the same order, the results
+/// are the same.
 pub struct Pipeline {
-    exposure: Developer,
+    front: Front,
+    back: Back,
+}
+
+/// What can be done for a frame while those before it are still on their way.
+pub struct Front {
+    linearizer: Linearizer,
+    newest: Option<Stamp>,
+}
+
+/// Everything from two linear frames to results.
+pub struct Back {
+    exposure: Pairing,
     flow: Matcher,
     motion: Odometer,
     lookout: Option<Lookout>,
     gap_ms_max: f64,
-    newest: Option<Stamp>,
     steps: u64,
 }
+
+/// What the front makes of a frame: one that is linear, or why it can't be made so. Of other samples it makes nothing.
+pub type Read = Option<Result<Linear, Error>>;
 
 /// What became of a sample.
 // Boxing the large variant would allocate on every step.
@@ -84,41 +102,131 @@ impl Pipeline {
             Resolution::Quarter => 1.0,
             Resolution::Full => 4.0,
         };
-        Ok(Self {
-            exposure: Developer::new(&config.exposure)?,
+        let back = Back {
+            exposure: Pairing::new(&config.exposure)?,
             flow,
             motion: Odometer::new(&motion)?.exposing(config.camera.exposure_s).standing_in(&config.publish.body_frame),
             lookout: motion.obstacles.as_ref().map(Lookout::new).transpose()?,
             gap_ms_max: config.flow.gap_ms_max,
-            newest: None,
             steps: 0,
-        })
+        };
+        Ok(Self { front: Front { linearizer: Linearizer::new(&config.exposure)?, newest: None }, back })
     }
 
     /// One sample's way. The flow is written into what `lender` lends and stays there until the next call.
     pub fn step(&mut self, sample: &Sample, lender: &mut dyn Lender, laps: &mut dyn Laps) -> Result<Outcome, Error> {
+        let read = self.front.read(sample);
+        self.back.step(sample, read, &mut |spare| self.front.reuse(spare), lender, laps)
+    }
+
+    /// The two halves, for who lets them run beside each other.
+    pub fn halves(&mut self) -> (&mut Front, &mut Back) {
+        (&mut self.front, &mut self.back)
+    }
+
+    /// The newest developed frame, for previews.
+    pub fn image(&self) -> Option<&Exposed> {
+        self.back.image()
+    }
+
+    /// What looks for obstacles, where it is asked to.
+    pub fn lookout(&self) -> Option<&Lookout> {
+        self.back.lookout.as_ref()
+    }
+
+    /// What camera and gyro disagree on, if they do beyond doubt.
+    pub fn diagnosis(&self) -> Option<Diagnosis> {
+        self.back.diagnosis()
+    }
+
+    /// The network that runs.
+    pub fn network(&self) -> &Matcher {
+        &self.back.flow
+    }
+}
+
+impl Front {
+    /// Makes a frame linear, and takes note of what concerns the frames after it.
+    pub fn read(&mut self, sample: &Sample) -> Read {
         match sample {
-            Sample::Frame(frame) => self.frame(frame, lender, laps),
-            Sample::Info(info) => Ok(self.motion.info(info).map(|()| Outcome::Noted)?),
-            Sample::Imu(imu) => Ok(self.motion.imu(imu).map(|()| Outcome::Noted)?),
-            Sample::Range(range) => Ok(self.motion.range(range).map(|()| Outcome::Noted)?),
+            Sample::Frame(frame) => Some(self.frame(frame)),
             Sample::Width(width) => {
-                self.exposure.set_width(width.columns as usize);
-                Ok(Outcome::Noted)
+                self.linearizer.set_width(width.columns as usize);
+                None
             }
-            Sample::Transforms(message) => Ok(self.motion.transforms(message).map(|()| Outcome::Noted)?),
+            _ => None,
         }
     }
 
-    fn frame(&mut self, frame: &Frame, lender: &mut dyn Lender, laps: &mut dyn Laps) -> Result<Outcome, Error> {
-        self.follow(frame.stamp())?;
-        self.exposure.develop(frame)?;
+    fn frame(&mut self, frame: &Frame) -> Result<Linear, Error> {
+        let came = frame.stamp();
+        if let Some(newest) = self.newest.replace(came).filter(|newest| came <= *newest) {
+            return Err(Error::ClockBack { newest, came });
+        }
+        Ok(self.linearizer.read(frame)?)
+    }
+
+    /// Takes back the memory of a frame: see [`Back::step`].
+    pub fn reuse(&mut self, spare: Linear) {
+        self.linearizer.reuse(spare);
+    }
+
+    /// The stamp of the newest frame that came.
+    pub fn newest(&self) -> Option<Stamp> {
+        self.newest
+    }
+}
+
+impl Back {
+    /// What the front has read goes on. `spare` is given the memory of a frame that is needed no longer, for every frame that
+    /// was read, before the network runs. The flow is written into what `lender` lends and stays there until the next call.
+    pub fn step(
+        &mut self,
+        sample: &Sample,
+        read: Read,
+        spare: &mut dyn FnMut(Linear),
+        lender: &mut dyn Lender,
+        laps: &mut dyn Laps,
+    ) -> Result<Outcome, Error> {
+        match (sample, read) {
+            (Sample::Frame(frame), Some(read)) => {
+                self.follow(frame.stamp(), &read);
+                spare(self.exposure.take(read?));
+                self.frame([frame.image.width, frame.image.height], lender, laps)
+            }
+            (Sample::Info(info), _) => Ok(self.motion.info(info).map(|()| Outcome::Noted)?),
+            (Sample::Imu(imu), _) => Ok(self.motion.imu(imu).map(|()| Outcome::Noted)?),
+            (Sample::Range(range), _) => Ok(self.motion.range(range).map(|()| Outcome::Noted)?),
+            (Sample::Transforms(message), _) => Ok(self.motion.transforms(message).map(|()| Outcome::Noted)?),
+            (Sample::Width(_), _) | (Sample::Frame(_), None) => Ok(Outcome::Noted),
+        }
+    }
+
+    /// Pairs only what belongs together: stamps that rise, and by no more than the gap allowed.
+    fn follow(&mut self, came: Stamp, read: &Result<Linear, Error>) {
+        match read {
+            Err(Error::ClockBack { .. }) => self.exposure.forget(),
+            // The partner is the frame before that could be developed, which a refused frame may have moved further away.
+            _ => self.exposure.forget_before(came, self.gap_ms_max),
+        }
+    }
+
+    /// The newest developed frame, for previews.
+    pub fn image(&self) -> Option<&Exposed> {
+        self.exposure.newest()
+    }
+
+    /// What camera and gyro disagree on, if they do beyond doubt.
+    pub fn diagnosis(&self) -> Option<Diagnosis> {
+        self.motion.diagnosis()
+    }
+
+    fn frame(&mut self, camera_size: [u32; 2], lender: &mut dyn Lender, laps: &mut dyn Laps) -> Result<Outcome, Error> {
         let Some(pair) = self.exposure.pair() else { return Ok(Outcome::Unpaired) };
         laps.lap(Stage::Exposure);
         let flow = self.flow.between(&pair, lender)?;
         let (state, confidence) = self.flow.judge(&pair, &flow);
         laps.lap(Stage::Flow);
-        let camera_size = [frame.image.width, frame.image.height];
         let velocity = match state {
             State::Blind(_) => Err(Lack::Blind),
             _ => self.motion.velocity(&flow, camera_size),
@@ -150,39 +258,5 @@ impl Pipeline {
         };
         self.steps += 1;
         Ok(Outcome::Moved(moved))
-    }
-
-    /// Pairs only what belongs together: stamps that rise, and by no more than the gap allowed.
-    fn follow(&mut self, came: Stamp) -> Result<(), Error> {
-        if let Some(newest) = self.newest.replace(came).filter(|newest| came <= *newest) {
-            self.exposure.forget();
-            return Err(Error::ClockBack { newest, came });
-        }
-        // The partner is the frame before that could be developed, which a refused frame may have moved further away.
-        let partner = self.exposure.newest().map(|older| came.seconds_since(older.stamp));
-        if partner.is_some_and(|gap_s| gap_s * 1e3 > self.gap_ms_max) {
-            self.exposure.forget();
-        }
-        Ok(())
-    }
-
-    /// The newest developed frame, for previews.
-    pub fn image(&self) -> Option<&Exposed> {
-        self.exposure.newest()
-    }
-
-    /// What looks for obstacles, where it is asked to.
-    pub fn lookout(&self) -> Option<&Lookout> {
-        self.lookout.as_ref()
-    }
-
-    /// What camera and gyro disagree on, if they do beyond doubt.
-    pub fn diagnosis(&self) -> Option<Diagnosis> {
-        self.motion.diagnosis()
-    }
-
-    /// The network that runs.
-    pub fn network(&self) -> &Matcher {
-        &self.flow
     }
 }

@@ -15,6 +15,7 @@ mod error;
 mod gain;
 mod hot;
 mod layout;
+mod linear;
 mod mosaic;
 mod noise;
 mod reduce;
@@ -22,8 +23,9 @@ mod rows;
 mod sums;
 
 pub use config::{Config, Justification, Packing, Pattern, REASONS};
-pub use develop::Developer;
+pub use develop::{Developer, Pairing};
 pub use error::Error;
+pub use linear::{Linear, Linearizer};
 pub use mosaic::{Mosaic, Plane};
 pub use noise::Noise;
 

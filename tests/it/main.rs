@@ -1,6 +1,7 @@
 //! All integration tests in one binary.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
+mod ahead;
 mod allocations;
 mod autopilots;
 mod avoid;
