@@ -16,7 +16,7 @@ from torch import nn
 
 import checkpoints
 from flownet import KINDS, FlowNet
-from networks import GAIN, PwcNet
+from networks import FACTOR, GAIN, OFFSET, SHIFT, PwcNet
 from raft import RaftSmall
 
 OPSET = 17
@@ -58,7 +58,7 @@ class PairGraph(nn.Module):
         *level2, scale = rest
         of = lambda matched, n: (None if self.fast else level2[n], matched, context)
         flows, expected = self.decoder(of(older, 0), of(newer, 1), self.fast)
-        return (4.0 * flows[-1]).permute(0, 2, 3, 1) * scale, expected[:, 0]
+        return (flows[-1] * (4.0 * scale).view(1, 2, 1, 1)).permute(0, 2, 3, 1), expected[:, 0]
 
 
 class CostVolume(torch.autograd.Function):
@@ -100,18 +100,63 @@ class Convolutions(torch.autograd.Function):
         return tuple(found) if kept else found
 
 
+class Normalised(torch.autograd.Function):
+    """`networks.normalised` as the node's own operator `nightflow::Normalised`."""
+
+    @staticmethod
+    def forward(ctx, features):
+        return torch.zeros_like(features)
+
+    @staticmethod
+    def symbolic(g, features):
+        found = g.op(f"{DOMAIN}::Normalised", features)
+        found.setType(features.type())
+        return found
+
+
+class Resized(torch.autograd.Function):
+    """A bilinear resize by a rule about where cells lie that PyTorch does not have, or does not export as one operator."""
+
+    @staticmethod
+    def forward(ctx, values, channels: int, by: float, rule: str):
+        rows, columns = (2 * length if by > 1 else length // 2 for length in values.shape[2:])
+        return values.new_zeros(1, channels, rows, columns)
+
+    @staticmethod
+    def symbolic(g, values, channels: int, by: float, rule: str):
+        nowhere = g.op("Constant", value_t=torch.tensor([], dtype=torch.float32))
+        scales = g.op("Constant", value_t=torch.tensor([1.0, 1.0, by, by]))
+        found = g.op("Resize", values, nowhere, scales, coordinate_transformation_mode_s=rule, mode_s="linear")
+        found.setType(values.type().with_sizes([1, channels, None, None]))
+        return found
+
+
+def twice_as_one(values: torch.Tensor) -> torch.Tensor:
+    """`networks.twice`: asymmetric is that every second cell is one of before, and those beyond the last are like the last."""
+    return Resized.apply(values, int(values.shape[1]), 2.0, "asymmetric")
+
+
+def halved_as_one(values: torch.Tensor) -> torch.Tensor:
+    """`networks.halved`: half of the pixels, each between four of before. A pooling would have ONNX Runtime reorder the channels."""
+    return Resized.apply(values, int(values.shape[1]), 0.5, "half_pixel")
+
+
 class EncoderLevels(torch.autograd.Function):
-    """RAFT-small's feature encoder in bf16, as the node's own operator `nightflow::Encoder`."""
+    """RAFT-small's feature encoder with what is projected from it in bf16, as the node's own operator `nightflow::Encoder`."""
 
     @staticmethod
-    def forward(ctx, image, middle: int, *tensors):
+    def forward(ctx, image, slopes: list[float], *tensors):
         rows, columns = image.shape[2:]
-        return tuple(image.new_zeros(1, count, rows // part, columns // part) for count, part in ((middle, 4), (tensors[-1].numel(), 8)))
+        eighth, quarter, projected = (bias.numel() for bias in tensors[-5::2])
+        sizes = ((quarter, 4), (eighth, 8), (projected, 8))
+        return tuple(image.new_zeros(1, count, rows // part, columns // part) for count, part in sizes)
 
     @staticmethod
-    def symbolic(g, image, middle: int, *tensors):
-        found = g.op(f"{DOMAIN}::Encoder", image, *tensors, outputs=2)
-        for value, count in zip(found, (middle, tensors[-1].type().sizes()[0])):
+    def symbolic(g, image, slopes: list[float], *tensors):
+        view = {"factor_f": FACTOR, "offset_f": OFFSET, "shift_i": SHIFT, "slopes_f": slopes}
+        found = g.op(f"{DOMAIN}::Encoder", image, *tensors, outputs=3, **view)
+        eighth, quarter, projected = (bias.type().sizes()[0] for bias in tensors[-5::2])
+        for value, count in zip(found, (quarter, eighth, projected)):
             value.setType(image.type().with_sizes([1, count, None, None]))
         return tuple(found)
 
@@ -134,40 +179,47 @@ def chained(layers: nn.Sequential, parts: list[torch.Tensor], kept: bool = False
 
 
 @contextlib.contextmanager
-def fused(network: PwcNet, bits: int = 32):
-    """Within it the decoder's levels match by the one operator, and convolve by the other."""
-    decoder = network.decoder
-    levels, plain = (decoder.shared, decoder.fine), decoder.through
-    chain = functools.partial(chained, bits=bits)
-    for level in levels:
-        level.match = lambda older, newer, flow, tile, fetch, level=level: CostVolume.apply(
-            older, newer, flow, level.sharpness, level.reach
-        )
-        level.layers = lambda parts, level=level: chain(nn.Sequential(level.body, level.predict), parts, kept=True)
-    decoder.through = chain
+def exchanged(parts: list[tuple[nn.Module, str, object]]):
+    """Within it these attributes of modules are these."""
+    before = [(module, name, module.__dict__.get(name)) for module, name, _ in parts]
+    for module, name, value in parts:
+        module.__dict__[name] = value
     try:
         yield
     finally:
-        for level in levels:
-            del level.match, level.layers
-        decoder.through = plain
+        for module, name, value in before:
+            if value is None:
+                del module.__dict__[name]
+            else:
+                module.__dict__[name] = value
+
+
+def fused(network: PwcNet, bits: int = 32):
+    """Within it the decoder's levels match by the one operator and convolve by the other, and what it resizes it does in one go."""
+    decoder, chain = network.decoder, functools.partial(chained, bits=bits)
+    parts = [(decoder, "through", chain), (decoder, "twice", twice_as_one), (decoder, "halved", halved_as_one)]
+    for level in (decoder.shared, decoder.fine):
+        match = lambda older, newer, flow, tile, fetch, level=level: CostVolume.apply(
+            older, newer, flow, level.sharpness, level.reach
+        )
+        layers = lambda parts, level=level: chain(nn.Sequential(level.body, level.predict), parts, kept=True)
+        parts += [(level, "match", match), (level, "layers", layers)]
+    return exchanged(parts)
 
 
 @contextlib.contextmanager
 def in_bf16(network: PwcNet):
-    """Within it factors are of 16 bits, and the encoder is an operator too."""
-    encoder = network.pyramid.encoder
+    """Within it factors are of 16 bits, and what looks at one frame has operators too."""
+    pyramid, encoder = network.pyramid, network.pyramid.encoder
     # In the order of use; a unit registers its short cut last, which is where the operator looks for it.
     parts = (encoder.conv1, encoder.layer1, encoder.layer2, encoder.layer3, encoder.conv2)
     used = [p for part in parts for p in part.modules() if isinstance(p, nn.Conv2d)]
-    weights = [tensor for convolution in used for tensor in (convolution.weight, convolution.bias)]
-    middle = encoder.layer2[-1].conv3.out_channels
-    with fused(network, bits=16):
-        encoder.levels = lambda image: EncoderLevels.apply(image, middle, *weights)
-        try:
-            yield
-        finally:
-            del encoder.levels
+    projections, slopes = convolutions_of(nn.Sequential(pyramid.quarter, pyramid.context))
+    weights = [tensor for convolution in used + projections for tensor in (convolution.weight, convolution.bias)]
+    levels = lambda image: EncoderLevels.apply(image, slopes, *weights)
+    own = [(pyramid, "levels", levels), (pyramid, "normalised", Normalised.apply)]
+    with fused(network, bits=16), exchanged(own):
+        yield
 
 
 class RaftFrameGraph(nn.Module):
@@ -272,7 +324,7 @@ def traced(
 
 def graphs_of(network: nn.Module, plain: bool = False) -> dict[str, onnx.ModelProto]:
     """`pyramid` and `decoder` graphs of a network in evaluation mode; of a PWC-Net, unless only `plain` ones are wanted, also
-    `fused`, the decoder with the node's own cost volume, and `pyramid_bf16` and `decoder_bf16` with its convolutions too."""
+    `fused`, the decoder with the node's own operators in 32 bits, and `pyramid_bf16` and `decoder_bf16`."""
     graphs = next(graphs for kind, graphs in GRAPHS.items() if isinstance(network, kind))
     frame, pair = (graph(network).eval() for graph in graphs)
     image = torch.rand(1, 3, GOLDEN_HEIGHT, GOLDEN_WIDTH)

@@ -35,6 +35,8 @@ TILES = {2: 16, 3: 8}
 LEVEL_WEIGHTS = (0.2, 0.3, 0.4, 0.6, 1.0)
 # The encoder's cell i of level n looks at pixel 2^n i; with the frame moved by so many pixels, at 2^n i + SHIFT.
 SHIFT = 2
+# What the encoder sees of an image of 0 to 1.
+FACTOR, OFFSET = 2.0, -1.0
 
 
 def conv(inputs: int, outputs: int, dilation: int = 1, size: int = 3) -> nn.Sequential:
@@ -47,7 +49,7 @@ def conv(inputs: int, outputs: int, dilation: int = 1, size: int = 3) -> nn.Sequ
 
 def through(layers: nn.Sequential, parts: list[torch.Tensor]) -> torch.Tensor:
     """Layers that read several tensors as one. One operator in the bf16 graph of export.py."""
-    return layers(torch.cat(parts, 1))
+    return layers(parts[0] if len(parts) == 1 else torch.cat(parts, 1))
 
 
 def cost_volume_plain(older: torch.Tensor, newer: torch.Tensor, reach: int = REACH) -> torch.Tensor:
@@ -135,10 +137,17 @@ class Pyramid(nn.Module):
         self.encoder = Encoder(FEATURES, normed=True)
         self.quarter = nn.Conv2d(64, QUARTER, 1)
         self.context = conv(FEATURES, CONTEXT_CHANNELS, size=1)
+        # What export.py exchanges for operators of the node's own.
+        self.normalised = normalised
+
+    def levels(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """The encoder's levels of the image as it sees it: projected at a quarter, as it is and projected at an eighth."""
+        quarter, eighth = self.encoder.levels(F.pad(FACTOR * image + OFFSET, [-SHIFT, SHIFT] * 2))
+        return self.quarter(quarter), eighth, self.context(eighth)
 
     def forward(self, image: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        quarter, eighth = self.encoder.levels(F.pad(2 * image - 1, [-SHIFT, SHIFT] * 2))
-        return normalised(self.quarter(quarter)), normalised(eighth), self.context(eighth)
+        quarter, eighth, context = self.levels(image)
+        return self.normalised(quarter), self.normalised(eighth), context
 
 
 class LevelDecoder(nn.Module):
@@ -200,12 +209,13 @@ class Decoder(nn.Module):
         )
         self.fine = LevelDecoder(NARROW_REACH, QUARTER, DECODER_CHANNELS[-1], NARROW_CHANNELS)
         self.error, self.fast_error = error_head(), error_head()
-        self.through = through
+        # What export.py exchanges for operators of the node's own, or for ONNX's that PyTorch does not have.
+        self.through, self.halved, self.twice = through, halved, twice
 
     def forward(self, older, newer, fast: bool = False):
         matched = {3: (older[1], newer[1], older[2])}
         for level in range(FINEST_SHARED + 1, COARSEST + 1):
-            matched[level] = tuple(halved(m) for m in matched[level - 1])
+            matched[level] = tuple(self.halved(m) for m in matched[level - 1])
         coarse = matched[COARSEST][0]
         flow, above = torch.zeros_like(coarse[:, :2]).float(), torch.zeros_like(coarse[:, : DECODER_CHANNELS[-1]])
         flows = []
@@ -218,11 +228,11 @@ class Decoder(nn.Module):
                 flow, above = self.shared(*matched[level], flow, above, columns(level, flow.device), fetch)
                 flows.append(flow)
         flows[-1] = flow = flow + self.through(self.context, [above, (0.25 * flow).to(above.dtype)]).float()
-        flow = 2.0 * twice(flow)
+        flow = 2.0 * self.twice(flow)
         coarser = F.softplus(self.through(self.fast_error, [above.detach()]).float()) + 0.01 if fast or self.training else None
         if fast:
-            return [*flows, flow], twice(coarser)
-        flow, features = self.fine(older[0], newer[0], older[0], flow, twice(above), columns(2, flow.device))
+            return [*flows, flow], self.twice(coarser)
+        flow, features = self.fine(older[0], newer[0], older[0], flow, self.twice(above), columns(2, flow.device))
         expected = F.softplus(self.through(self.error, [features.detach()]).float()) + 0.01
         return [*flows, flow], [coarser, expected] if self.training else expected
 

@@ -12,6 +12,7 @@ mod lanes;
 pub mod manifest;
 mod matcher;
 mod network;
+mod normalised;
 mod onnx;
 mod onnx_graph;
 mod onnx_shared;

@@ -11,11 +11,11 @@ use ort::{
     operator::{ComputeContext, OperatorDomain},
 };
 
-use crate::flow::{convolutions, cost_volume};
+use crate::flow::{convolutions, cost_volume, normalised};
 
 /// What a session needs to run graphs with them.
 pub fn domain() -> Result<OperatorDomain> {
-    let domain = OperatorDomain::new("nightflow")?.add(cost_volume::Fused)?;
+    let domain = OperatorDomain::new("nightflow")?.add(cost_volume::Fused)?.add(normalised::Normalise)?;
     domain.add(convolutions::Convolutions)?.add(convolutions::Encode)
 }
 

@@ -6,14 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 
 import int8
 from export import (GOLDEN_COLUMNS, GOLDEN_ROWS, OPSET, Exported, gigamacs, golden_frames, graphs_of, manifest_entry,
-                    moved, parity, rounded, write_manifest)
+                    halved_as_one, moved, parity, rounded, traced, twice_as_one, write_manifest)
 from flownet import FlowNetS
-from networks import PwcNet
+from networks import PwcNet, halved, twice
 from raft import RaftSmall
 
 MODELS = Path(__file__).parents[2] / "models"
@@ -120,10 +121,12 @@ def test_the_bf16_graphs_are_called_alike_and_convolve_by_their_operators(fresh)
         assert [output.name for output in plain.graph.output] == [output.name for output in own.graph.output]
         given = {node.op_type: node for node in own.graph.node if node.domain == "nightflow"}
         chains = [node for node in own.graph.node if node.op_type == "Convolutions"]
-        # What is left of ONNX's own are the 1x1 projections behind the encoder.
-        assert sum(node.op_type == "Conv" for node in own.graph.node) == (2 if part == "pyramid" else 0)
+        assert not any(node.op_type == "Conv" for node in own.graph.node)
         if part == "pyramid":
-            assert set(given) == {"Encoder"} and len(given["Encoder"].input) == 1 + 2 * 22
+            # The encoder sees the image as the network does, and two projections are its own.
+            assert set(given) == {"Encoder", "Normalised"} and len(given["Encoder"].input) == 1 + 2 * 24
+            view = {a.name: onnx.helper.get_attribute_value(a) for a in given["Encoder"].attribute}
+            assert np.allclose(view.pop("slopes"), [1.0, 0.1]) and view == {"factor": 2.0, "offset": -1.0, "shift": 2}
             continue
         assert set(given) == {"CostVolume", "Convolutions"}
         # Levels 5, 4, 3 and 3 again, the context network, level 2, a head for the expected error.
@@ -136,6 +139,21 @@ def test_the_bf16_graphs_are_called_alike_and_convolve_by_their_operators(fresh)
             assert len(node.input) == of(node, "parts") + 2 * len(of(node, "slopes"))
     # Nothing of the tracing stays with the network.
     network(*(torch.rand(1, 3, 64, 64) for _ in range(2)))[0][-1].sum().backward()
+
+
+@pytest.mark.parametrize("plain, one", [(twice, twice_as_one), (halved, halved_as_one)])
+def test_resizing_by_one_operator_is_the_same(plain, one):
+    class Wrapped(torch.nn.Module):
+        def forward(self, values):
+            return one(values)
+
+    values = torch.rand(1, 3, 6, 10)
+    graph = traced(Wrapped(), (values,), ["values"], ["found"], {"values": {2: "rows", 3: "columns"}})
+    assert [node.op_type for node in graph.graph.node if node.op_type != "Constant"] == ["Resize"]
+    session = onnxruntime.InferenceSession(graph.SerializeToString(), providers=["CPUExecutionProvider"])
+    for values in (values, torch.rand(1, 3, 8, 4)):
+        found = session.run(None, {"values": values.numpy()})[0]
+        np.testing.assert_allclose(found, plain(values).numpy(), atol=1e-6)
 
 
 def test_golden_frames_follow_their_formula():

@@ -1,11 +1,12 @@
-//! RAFT-small's feature encoder (Teed and Deng 2020), each convolution but the last one followed by an instance norm.
+//! RAFT-small's feature encoder (Teed and Deng 2020), each convolution but the last one followed by an instance norm, and what
+//! is projected from its levels.
 
 use super::{
     Spread,
     layer::{Layer, Step, To},
     map::Map,
     rows::{self, Norm},
-    tiles::{Begun, LANES, Line, SIDE, Unit, Work},
+    tiles::{Begun, LANES, Line, Unit, Work},
 };
 use crate::flow::bands::{Band, Bands};
 
@@ -22,16 +23,19 @@ pub struct Weights<'a> {
     pub values: &'a [f32],
     /// Their shape.
     pub shape: [usize; 4],
-    /// One for each output, of the last convolution; a norm takes the others' away again.
+    /// One for each output; where a norm follows it takes this away again.
     pub bias: &'a [f32],
+    /// What negative results are multiplied with where no norm follows; at most 1.
+    pub slope: f32,
 }
 
 /// A layer of units: whether the first halves the map.
 const STRIDES: [usize; 3] = [1, 2, 2];
 /// The unit at a quarter of the image's rows and columns that is the last one there.
 const QUARTER: usize = 3;
-/// Convolutions that it takes: the first, three for each of two units a layer, one for each short cut, the last.
-pub const CONVOLUTIONS: usize = 1 + 3 * 2 * STRIDES.len() + 2 + 1;
+/// Convolutions that it takes: the first, three for each of two units a layer, one for each short cut, the last, and two of
+/// 1 × 1 that project what comes out at a quarter and at an eighth of the image's rows and columns.
+pub const CONVOLUTIONS: usize = 1 + 3 * 2 * STRIDES.len() + 2 + 1 + 2;
 
 /// What does not fit.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -53,8 +57,8 @@ pub enum Unfit {
         height: usize,
         /// Columns.
         width: usize,
-        /// Of the image, the quarter and the eighth.
-        found: [usize; 3],
+        /// Of the image, the projected quarter, the eighth and what is projected from it.
+        found: [usize; 4],
     },
 }
 
@@ -76,10 +80,28 @@ struct Bottleneck {
     short: Option<Normed>,
 }
 
+/// How the encoder sees an image: `factor` · value + `offset`, and that without its first `shift` rows and columns, with as many
+/// of zeros at the end.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct View {
+    /// What values are multiplied with.
+    pub factor: f32,
+    /// What is added then.
+    pub offset: f32,
+    /// Rows and columns; even.
+    pub shift: usize,
+}
+
+impl View {
+    /// The image as it is.
+    pub const WHOLE: Self = Self { factor: 1.0, offset: 0.0, shift: 0 };
+}
+
 /// The operator `nightflow::Encoder` with its memory, which is taken at the first call of a size.
 #[derive(Debug)]
 pub struct Encoder {
     unit: Unit,
+    view: View,
     /// The image, with all columns that the first convolution looks at side by side.
     image: Map,
     /// For each band the even and the odd columns of a row.
@@ -87,6 +109,10 @@ pub struct Encoder {
     first: Normed,
     units: Vec<Bottleneck>,
     last: Layer,
+    /// What the last one gives, for the projection that reads it.
+    eighth: Map,
+    /// Projections of the quarter and of the eighth.
+    projections: [Layer; 2],
 }
 
 impl Normed {
@@ -193,11 +219,12 @@ impl Bottleneck {
 
 impl Encoder {
     /// Weights in the order in which they are used, a short cut's after those of its unit: [`CONVOLUTIONS`] of them.
-    pub fn new(unit: Unit, weights: &[Weights<'_>]) -> Result<Self, Unfit> {
+    pub fn new(unit: Unit, view: View, weights: &[Weights<'_>]) -> Result<Self, Unfit> {
         let mut numbered = weights.iter().enumerate();
         let mut take = |inputs: Option<usize>, size: usize, stride: usize, biased: bool| {
-            let (number, weights) =
-                numbered.next().unwrap_or((CONVOLUTIONS, &Weights { values: &[], shape: [0; 4], bias: &[] }));
+            let (number, weights) = numbered
+                .next()
+                .unwrap_or((CONVOLUTIONS, &Weights { values: &[], shape: [0; 4], bias: &[], slope: 1.0 }));
             let [outputs, found, rows, columns] = weights.shape;
             let whole =
                 weights.values.len() == weights.shape.iter().product::<usize>() && weights.bias.len() == outputs;
@@ -205,8 +232,8 @@ impl Encoder {
                 let wanted = format!("{size} × {size} weights of {inputs:?} inputs and a bias for each output");
                 return Err(Unfit::Weights { number, wanted, found: weights.shape });
             }
-            let step = Step { stride: [stride; 2], dilation: 1, slope: 1.0 };
-            let bias = if biased { weights.bias } else { &[] };
+            let (bias, slope) = if biased { (weights.bias, weights.slope) } else { (&[][..], 1.0) };
+            let step = Step { stride: [stride; 2], dilation: 1, slope };
             Ok((Layer::new(weights.values, weights.shape, bias, step), *weights))
         };
         let (_, image) = take(Some(COLOURS), FIRST, 2, false)?;
@@ -220,7 +247,7 @@ impl Encoder {
         }
         let step = Step { stride: [2, 1], dilation: 1, slope: 1.0 };
         let first = Normed::new(Layer::new(&turned, [outputs, COLOURS * FIRST, FIRST, 1], &[], step));
-        let (mut units, mut width) = (vec![], outputs);
+        let (mut units, mut width, mut quarter) = (vec![], outputs, outputs);
         for stride in STRIDES {
             for stride in [stride, 1] {
                 let (one, inner) = take(Some(width), 1, 1, false)?;
@@ -234,31 +261,41 @@ impl Encoder {
                 width = last.shape[0];
                 let inner = [one, two].map(Normed::new);
                 units.push(Bottleneck { inner, last: Normed::new(three), short: short.map(Normed::new) });
+                quarter = if units.len() <= QUARTER + 1 { width } else { quarter };
             }
         }
         let (last, _) = take(Some(width), 1, 1, true)?;
-        Ok(Self { unit, image: Map::default(), columns: vec![], first, units, last })
+        let projections = [take(Some(quarter), 1, 1, true)?.0, take(Some(last.outputs()), 1, 1, true)?.0];
+        let (image, eighth, columns) = (Map::default(), Map::default(), vec![]);
+        Ok(Self { unit, view, image, columns, first, units, last, eighth, projections })
     }
 
-    /// Channels of the quarter and of the eighth.
-    pub fn outputs(&self) -> [usize; 2] {
-        [self.units[QUARTER].last.layer.outputs(), self.last.outputs()]
+    /// Channels of the projected quarter, of the eighth, and of what is projected from that.
+    pub fn outputs(&self) -> [usize; 3] {
+        let [quarter, eighth] = &self.projections;
+        [quarter.outputs(), self.last.outputs(), eighth.outputs()]
     }
 
-    /// An image of three planes of height × width (multiples of eight) to what the second layer gives at a quarter of its rows
-    /// and columns and the last convolution at an eighth, both as planes.
+    /// An image of three planes of height × width (multiples of eight) to planes: what is projected from the second layer's results
+    /// at a quarter of its rows and columns, what the last convolution gives at an eighth, and what is projected from that.
     pub fn run<E: From<Unfit>>(
         &mut self,
         image: &[f32],
         [height, width]: [usize; 2],
-        quarter: &mut [f32],
-        eighth: &mut [f32],
+        [quarter, eighth, projected]: [&mut [f32]; 3],
         spread: &impl Spread<E>,
     ) -> Result<(), E> {
         let (unit, cells, channels) = (self.unit, height * width, self.outputs());
-        let found = [image.len(), quarter.len(), eighth.len()];
-        let wanted = [COLOURS * cells, channels[0] * cells / 16, channels[1] * cells / 64];
-        if found != wanted || cells == 0 || height % 8 != 0 || width % 8 != 0 {
+        let found = [image.len(), quarter.len(), eighth.len(), projected.len()];
+        let wanted = [COLOURS * cells, channels[0] * cells / 16, channels[1] * cells / 64, channels[2] * cells / 64];
+        let shift = self.view.shift;
+        if found != wanted
+            || cells == 0
+            || height % 8 != 0
+            || width % 8 != 0
+            || !shift.is_multiple_of(2)
+            || shift > width
+        {
             return Err(Unfit::Size { height, width, found }.into());
         }
         self.look(image, [height, width], spread)?;
@@ -269,13 +306,13 @@ impl Encoder {
             let from = before.last().map_or(&self.first.map, |unit| &unit.last.map);
             following[0].run(unit, from, spread)?;
         }
-        spill(unit, &self.units[QUARTER].last.map, quarter, spread)?;
-        self.last.run(
-            unit,
-            &self.units[2 * STRIDES.len() - 1].last.map,
-            To { map: None, planes: Some(eighth), sums: None },
-            spread,
-        )
+        let planes = |planes| To { map: None, planes: Some(planes), sums: None };
+        let Self { units, last, eighth: map, projections: [of_quarter, of_eighth], .. } = self;
+        of_quarter.run(unit, &units[QUARTER].last.map, planes(quarter), spread)?;
+        map.resize([last.outputs(), height / 8, width / 8], 0);
+        let from = &units[2 * STRIDES.len() - 1].last.map;
+        last.run(unit, from, To { map: Some(map), ..planes(eighth) }, spread)?;
+        of_eighth.run(unit, map, planes(projected), spread)
     }
 
     /// The image as the first convolution reads it: a pixel for every second column, with that column and three on either
@@ -283,7 +320,7 @@ impl Encoder {
     fn look<E>(&mut self, image: &[f32], [height, width]: [usize; 2], spread: &impl Spread<E>) -> Result<(), E> {
         let half = width / 2;
         self.image.resize([COLOURS * FIRST, height, half], FIRST / 2);
-        let (unit, margin) = (self.unit, self.image.margin);
+        let (unit, view, margin) = (self.unit, self.view, self.image.margin);
         let (_, bands) = Map::bands(height);
         let stride = half + 2 * BESIDE;
         self.columns.resize(bands * 2 * COLOURS * stride, 0.0);
@@ -291,7 +328,7 @@ impl Encoder {
         let to = self.image.cut();
         spread(bands, &|number| {
             if let (Some(to), Some(own)) = (to.take(number), own.take(number)) {
-                unit.run(Look { image, height, width, number, margin, own, to });
+                unit.run(Look { image, height, width, view, number, margin, own, to });
             }
         })
     }
@@ -304,6 +341,7 @@ struct Look<'a> {
     image: &'a [f32],
     height: usize,
     width: usize,
+    view: View,
     number: usize,
     margin: usize,
     own: Band<'a, f32>,
@@ -313,7 +351,7 @@ struct Look<'a> {
 impl Work for Look<'_> {
     #[inline(always)]
     fn on(mut self, begun: &Begun) {
-        let Self { image, height, width, number, margin, .. } = self;
+        let Self { image, height, width, view: View { factor, offset, shift }, number, margin, .. } = self;
         let (half, columns) = (width / 2, self.own.row(0, number));
         let stride = half + 2 * BESIDE;
         // Images of another size may have been here.
@@ -324,12 +362,16 @@ impl Work for Look<'_> {
         for y in self.to.first..self.to.end {
             // Even and odd columns of each colour apart: what was every second number is then side by side.
             for (c, two) in columns.chunks_exact_mut(2 * stride).enumerate() {
-                let row = &image[(c * height + y) * width..][..width];
                 let (even, odd) = two.split_at_mut(stride);
-                let both = even[BESIDE..].iter_mut().zip(&mut odd[BESIDE..]);
-                for ((even, odd), two) in both.zip(row.as_chunks::<2>().0) {
-                    (*even, *odd) = (two[0], two[1]);
+                let (even, odd) = (&mut even[BESIDE..][..half], &mut odd[BESIDE..][..half]);
+                let from = y + shift;
+                let row = if from < height { &image[(c * height + from) * width..][shift..width] } else { &[] };
+                let pairs = row.as_chunks::<2>().0;
+                for ((even, odd), two) in even.iter_mut().zip(&mut *odd).zip(pairs) {
+                    (*even, *odd) = (factor * two[0] + offset, factor * two[1] + offset);
                 }
+                even[pairs.len()..].fill(0.0);
+                odd[pairs.len()..].fill(0.0);
             }
             // Column 2 x + tap − 3 is an odd one for every even tap.
             let channels = std::array::from_fn(|channel| {
@@ -338,41 +380,6 @@ impl Work for Look<'_> {
                 (tap < FIRST).then(|| &columns[from..][..half])
             });
             rows::pack(begun.has_vectors(), &channels, &mut self.to.row(0, y)[margin..][..half], 1);
-        }
-    }
-}
-
-/// A map as planes.
-fn spill<E>(unit: Unit, from: &Map, to: &mut [f32], spread: &impl Spread<E>) -> Result<(), E> {
-    let (rows, bands) = Map::bands(from.height);
-    let to = Bands::new(to, [from.channels, from.height, from.width], rows);
-    spread(bands, &|number| {
-        if let Some(to) = to.take(number) {
-            unit.run(Spill { from, to });
-        }
-    })
-}
-
-struct Spill<'a> {
-    from: &'a Map,
-    to: Band<'a, f32>,
-}
-
-impl Work for Spill<'_> {
-    #[inline(always)]
-    fn on(mut self, begun: &Begun) {
-        let (fast, depth, mut wide) = (begun.has_vectors(), self.from.depth(), [[0.0; LANES]; SIDE]);
-        for y in self.to.first..self.to.end {
-            for line in 0..depth {
-                let mut pixels = self.from.row(y)[line..].iter().step_by(depth).copied();
-                for x in (0..self.from.width).step_by(SIDE) {
-                    let some = rows::widen(fast, pixels.by_ref().take(SIDE), &mut wide);
-                    let channels = LANES.min(self.from.channels - line * LANES);
-                    rows::spread(fast, &wide[..some], channels, |channel, row| {
-                        self.to.row(line * LANES + channel, y)[x..x + some].copy_from_slice(row);
-                    });
-                }
-            }
         }
     }
 }

@@ -20,7 +20,7 @@ pub(super) mod tests;
 mod tiles;
 
 pub use chain::Chain;
-pub use encoder::{CONVOLUTIONS, Encoder, Weights};
+pub use encoder::{CONVOLUTIONS, Encoder, View, Weights};
 pub use layer::{Layer, Step};
 pub use operator::{Convolutions, Encode};
 pub use tiles::Unit;

@@ -8,7 +8,7 @@ use ort::{
     value::TensorElementType,
 };
 
-use super::{CONVOLUTIONS, Chain, Encoder, Layer, Step, Unit, Weights, chain, encoder};
+use super::{CONVOLUTIONS, Chain, Encoder, Layer, Step, Unit, View, Weights, chain, encoder};
 use crate::flow::{
     onnx_shared,
     operators::{input, output, spread},
@@ -44,7 +44,9 @@ impl From<encoder::Unfit> for Error {
 pub struct Convolutions;
 
 /// `nightflow::Encoder(image [1, 3, H, W], weight, bias …)`: RAFT-small's feature encoder, convolutions in the order in which
-/// they are used. Outputs: the second layer's, and the last convolution's.
+/// they are used, then two projections of 1 × 1. Attributes: how the image is seen, by `factor`, `offset` and an even `shift`, as it
+/// is where they are missing; and `slopes`, what the projections multiply negative results with, 1 where they are missing.
+/// Outputs: what is projected from the second layer's, what the last convolution gives, and what is projected from that.
 pub struct Encode;
 
 /// A node of a graph.
@@ -218,7 +220,7 @@ impl Operator for Encode {
     }
 
     fn outputs(&self) -> impl IntoIterator<Item = OperatorOutput> {
-        [const { OperatorOutput::required(TensorElementType::Float32) }; 2]
+        [const { OperatorOutput::required(TensorElementType::Float32) }; 3]
     }
 
     fn create_kernel<'attr>(&self, attributes: &KernelContext<'attr>) -> Result<EncoderNode> {
@@ -231,9 +233,20 @@ impl Operator for Encode {
         }
         let layers = (0..CONVOLUTIONS).map(|number| layer(attributes, ENCODER, 1 + 2 * number));
         let layers = layers.collect::<Result<Vec<_>>>()?;
-        let weights: Vec<Weights<'_>> =
-            layers.iter().map(|(shape, values, bias)| Weights { values, shape: *shape, bias }).collect();
-        Ok(EncoderNode { work: Encoder::new(Unit::best(), &weights)? })
+        let slopes: Vec<f32> = attributes.get("slopes").unwrap_or(vec![1.0; 2]);
+        if slopes.len() != 2 || slopes.iter().any(|slope| !(0.0..=1.0).contains(slope)) {
+            return Err(Error::new(format!("{ENCODER}: slopes should be two numbers of 0 to 1, they are {slopes:?}")));
+        }
+        let slope = |number: usize| (number + 2).checked_sub(CONVOLUTIONS).map_or(1.0, |projection| slopes[projection]);
+        let weights = layers.iter().enumerate();
+        let weights: Vec<Weights<'_>> = weights
+            .map(|(number, (shape, values, bias))| Weights { values, shape: *shape, bias, slope: slope(number) })
+            .collect();
+        let shift: i64 = attributes.get("shift").unwrap_or(0);
+        let shift = usize::try_from(shift).ok().filter(|shift| shift.is_multiple_of(2));
+        let shift = shift.ok_or_else(|| Error::new(format!("{ENCODER}: shift should be an even number of pixels")))?;
+        let (factor, offset) = (attributes.get("factor").unwrap_or(1.0), attributes.get("offset").unwrap_or(0.0));
+        Ok(EncoderNode { work: Encoder::new(Unit::best(), View { factor, offset, shift }, &weights)? })
     }
 }
 
@@ -246,9 +259,10 @@ impl Kernel for EncoderNode {
         let of = |channels: usize, part: usize| [1, channels, height / part, width / part].map(|length| length as i64);
         let quarter = output(context, 0, of(channels[0], 4))?;
         let eighth = output(context, 1, of(channels[1], 8))?;
+        let projected = output(context, 2, of(channels[2], 8))?;
         let spread = |count: usize, work: &(dyn Fn(usize) + Sync)| {
             shared(context, height * width >= CELLS_SPREAD_MIN, count, work)
         };
-        self.work.run(image, [height, width], quarter, eighth, &spread)
+        self.work.run(image, [height, width], [quarter, eighth, projected], &spread)
     }
 }

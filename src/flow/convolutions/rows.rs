@@ -116,24 +116,6 @@ pub fn spread(fast: bool, results: &[Wide], channels: usize, mut each: impl FnMu
     }
 }
 
-/// Some pixels' lines as numbers of 32 bits.
-#[inline(always)]
-pub fn widen(fast: bool, from: impl Iterator<Item = Line>, to: &mut [Wide; SIDE]) -> usize {
-    let mut some = 0;
-    for (line, to) in from.zip(to) {
-        some += 1;
-        #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-        if fast {
-            // SAFETY: the caller has seen that the processor has these vectors.
-            unsafe { widen_by_vectors(&line, to) };
-            continue;
-        }
-        let _ = fast;
-        *to = line.0.map(widened);
-    }
-    some
-}
-
 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
 mod vectors {
     use super::*;
@@ -252,12 +234,6 @@ fn join_by_vectors(row: &mut [Line], depth: usize, norm: Norm<'_>, short: Option
     }
 }
 
-#[cfg(all(target_arch = "x86_64", target_os = "linux"))]
-#[target_feature(enable = "avx512f")]
-fn widen_by_vectors(line: &Line, to: &mut Wide) {
-    vectors::store(vectors::widen(line), to);
-}
-
 /// Two channels of a pixel side by side are a number of 32 bits; 16 such rows, turned, are a line of each of 16 pixels.
 #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
@@ -336,8 +312,10 @@ mod tests {
                 }
                 let mut planes = vec![vec![0.0; SIDE]; 29];
                 let mut wide = [[0.0; LANES]; SIDE];
-                let some = widen(fast, lines.iter().step_by(depth).copied(), &mut wide);
-                assert_eq!(some, count.min(SIDE));
+                let some = count.min(SIDE);
+                for (wide, Line(line)) in wide.iter_mut().zip(lines.iter().step_by(depth)) {
+                    *wide = line.map(widened);
+                }
                 spread(fast, &wide[..some], 29, |c, row| planes[c][..some].copy_from_slice(row));
                 for (c, plane) in planes.iter().enumerate() {
                     for (x, value) in plane.iter().enumerate().take(some) {

@@ -196,8 +196,18 @@ fn shapes(first: usize, layers: [usize; 3], last: usize) -> Vec<[usize; 4]> {
             width = out;
         }
     }
-    shapes.push([last, width, 1, 1]);
+    shapes.extend([[last, width, 1, 1], [20, layers[1], 1, 1], [9, last, 1, 1]]);
     shapes
+}
+
+/// What negative results are multiplied with, and where no norm follows: the last three.
+fn slope(number: usize) -> f32 {
+    if number + 1 == CONVOLUTIONS { 0.1 } else { 1.0 }
+}
+
+/// Where results go to.
+fn slices(planes: &mut [Vec<f32>; 3]) -> [&mut [f32]; 3] {
+    planes.each_mut().map(Vec::as_mut_slice)
 }
 
 #[test]
@@ -207,8 +217,9 @@ fn the_encoder_is_raft_smalls() {
     let values: Vec<Vec<f32>> =
         shapes.iter().enumerate().map(|(i, shape)| noise(i as u64, shape.iter().product())).collect();
     let bias: Vec<Vec<f32>> = shapes.iter().enumerate().map(|(i, shape)| noise(100 + i as u64, shape[0])).collect();
-    let weights: Vec<Weights<'_>> =
-        (0..shapes.len()).map(|i| Weights { values: &values[i], shape: shapes[i], bias: &bias[i] }).collect();
+    let weights: Vec<Weights<'_>> = (0..shapes.len())
+        .map(|i| Weights { values: &values[i], shape: shapes[i], bias: &bias[i], slope: slope(i) })
+        .collect();
     let (height, width) = (48, 40);
     // Waves, so that norms have something to do.
     let image: Vec<f32> = (0..3 * height * width)
@@ -216,13 +227,18 @@ fn the_encoder_is_raft_smalls() {
         .collect();
     let mut number = 0;
     let mut convolve = |from: &Planes, stride: usize, biased: bool| {
-        let step = Step { stride: [stride; 2], dilation: 1, slope: 1.0 };
+        let step = Step { stride: [stride; 2], dilation: 1, slope: slope(number) };
         let bias = if biased { &bias[number][..] } else { &[] };
         number += 1;
         from.convolved(&values[number - 1], shapes[number - 1], bias, step)
     };
-    let image_planes =
-        Planes { values: image.iter().map(|v| f64::from(*v)).collect(), shape: [3, height, width] }.rounded();
+    let view = View { factor: 1.5, offset: -0.25, shift: 2 };
+    let seen = |i: usize| {
+        let (c, y, x) = (i / (height * width), i / width % height + view.shift, i % width + view.shift);
+        let inside = y < height && x < width;
+        if inside { f64::from(view.factor * image[(c * height + y) * width + x] + view.offset) } else { 0.0 }
+    };
+    let image_planes = Planes { values: (0..image.len()).map(seen).collect(), shape: [3, height, width] }.rounded();
     let smooth = |planes: Planes| planes.normalised().positive().rounded();
     let mut x = smooth(convolve(&image_planes, 2, false));
     let mut quarter = None;
@@ -241,26 +257,26 @@ fn the_encoder_is_raft_smalls() {
         }
     }
     let eighth = convolve(&x, 1, true);
-    let quarter = quarter.unwrap();
+    let quarter = convolve(&quarter.unwrap(), 1, true);
+    let projected = convolve(&eighth.clone().rounded(), 1, true);
     for unit in Unit::all() {
-        let mut encoder = Encoder::new(unit, &weights).unwrap();
-        assert_eq!(encoder.outputs(), [64, 40]);
-        let mut found = [vec![f32::NAN; 64 * 12 * 10], vec![f32::NAN; 40 * 6 * 5]];
+        let mut encoder = Encoder::new(unit, view, &weights).unwrap();
+        assert_eq!(encoder.outputs(), [20, 40, 9]);
+        let mut found = [vec![f32::NAN; 20 * 12 * 10], vec![f32::NAN; 40 * 6 * 5], vec![f32::NAN; 9 * 6 * 5]];
         let mut again = found.clone();
-        let [a, b] = &mut found;
-        let Ok(()) = encoder.run::<Infallible>(&image, [height, width], a, b, &backwards);
-        let [c, d] = &mut again;
-        let Ok(()) = encoder.run::<Infallible>(&image, [height, width], c, d, &shared);
+        let Ok(()) = encoder.run::<Infallible>(&image, [height, width], slices(&mut found), &backwards);
+        let Ok(()) = encoder.run::<Infallible>(&image, [height, width], slices(&mut again), &shared);
         assert_eq!(found, again);
         // Nor does it matter what was looked at before.
         let wider = noise(5, 3 * 64 * 96);
-        let (mut of_wider, mut of_eighth) = (vec![0.0; 64 * 16 * 24], vec![0.0; 40 * 8 * 12]);
-        let Ok(()) = encoder.run::<Infallible>(&wider, [64, 96], &mut of_wider, &mut of_eighth, &shared);
-        let [a, b] = &mut again;
-        let Ok(()) = encoder.run::<Infallible>(&image, [height, width], a, b, &backwards);
+        let mut of_wider = [vec![0.0; 20 * 16 * 24], vec![0.0; 40 * 8 * 12], vec![0.0; 9 * 8 * 12]];
+        let Ok(()) = encoder.run::<Infallible>(&wider, [64, 96], slices(&mut of_wider), &shared);
+        let Ok(()) = encoder.run::<Infallible>(&image, [height, width], slices(&mut again), &backwards);
         assert_eq!(found, again);
-        let (one, other) = (apart(&found[0], &quarter.values), apart(&found[1], &eighth.values));
-        assert!(one < 0.01 && other < 0.02, "{unit:?}: {one}, {other}");
+        for (found, (wanted, allowed)) in found.iter().zip([(&quarter, 0.01), (&eighth, 0.02), (&projected, 0.02)]) {
+            let error = apart(found, &wanted.values);
+            assert!(error < allowed, "{unit:?}: {error}");
+        }
     }
 }
 
@@ -271,13 +287,13 @@ fn weights_of_another_network_are_refused() {
     let values: Vec<Vec<f32>> = shapes.iter().map(|shape| vec![0.1; shape.iter().product()]).collect();
     let bias = [0.0; 96];
     let weights: Vec<Weights<'_>> = (0..shapes.len())
-        .map(|i| Weights { values: &values[i], shape: shapes[i], bias: &bias[..shapes[i][0]] })
+        .map(|i| Weights { values: &values[i], shape: shapes[i], bias: &bias[..shapes[i][0]], slope: 1.0 })
         .collect();
-    let error = Encoder::new(Unit::Plain, &weights).unwrap_err().to_string();
+    let error = Encoder::new(Unit::Plain, View::WHOLE, &weights).unwrap_err().to_string();
     assert_eq!(
         error,
         "the encoder's convolution 3 should have 1 × 1 weights of Some(8) inputs and a bias for each output, it has [32, 9, 1, 1]"
     );
-    let error = Encoder::new(Unit::Plain, &weights[..2]).unwrap_err().to_string();
+    let error = Encoder::new(Unit::Plain, View::WHOLE, &weights[..2]).unwrap_err().to_string();
     assert!(error.contains("the encoder's convolution"), "{error}");
 }
