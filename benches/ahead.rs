@@ -112,12 +112,18 @@ fn median(mut values: Vec<f64>) -> f64 {
 fn report(frames: usize, rounds: usize) -> Result<(), Box<dyn Error>> {
     let mut ways = vec![("fp32", "")];
     if convolutions::Unit::best().is_fast() {
-        ways.push(("bf16", "[flow]\nprecision = \"bf16\"\n"));
+        ways.push(("bf16", "precision = \"bf16\"\n"));
     }
     println!("{frames} frames, {rounds} rounds in turns; milliseconds a frame, medians:\n");
-    println!("| precision, camera | one after the other | beside the network | ratio |\n|{}", " --- |".repeat(4));
-    for (precision, settings) in ways {
-        let text = format!("{settings}[exposure]\nbit_depth = 12\nblack_level = {}\n", rivals::BLACK);
+    println!(
+        "| precision, network's threads, camera | one after the other | beside the network | ratio |\n|{}",
+        " --- |".repeat(4)
+    );
+    for ((precision, settings), threads) in ways.into_iter().flat_map(|way| [1, 2].map(|threads| (way, threads))) {
+        let text = format!(
+            "[flow]\nthreads = {threads}\n{settings}[exposure]\nbit_depth = 12\nblack_level = {}\n",
+            rivals::BLACK
+        );
         let config = Config::parse(&text, Path::new("ahead"))?;
         for size in SIZES {
             let images = Arc::new(images(size));
@@ -142,7 +148,7 @@ fn report(frames: usize, rounds: usize) -> Result<(), Box<dyn Error>> {
             }
             let [width, height] = size;
             println!(
-                "| {precision}, {width}×{height} | {:.2} | {:.2} | {:.3} |",
+                "| {precision}, {threads}, {width}×{height} | {:.2} | {:.2} | {:.3} |",
                 median(serial),
                 median(node),
                 median(ratios)
