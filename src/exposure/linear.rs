@@ -9,20 +9,13 @@ use super::{
     reduce::{Plan, Reducer, Target},
     rows::{self, Fingerprint, Found},
 };
-use crate::{camera::Frame, clock::Stamp, wire::Image};
+use crate::{camera::Frame, wire::Image};
 
 /// A frame that has been summed to the network's size and has no gain yet.
 #[derive(Debug, Default)]
 pub struct Linear {
     pub(super) exposed: Exposed,
     pub(super) fingerprint: u64,
-}
-
-impl Linear {
-    /// When the frame was taken.
-    pub fn stamp(&self) -> Stamp {
-        self.exposed.stamp
-    }
 }
 
 /// Makes frames linear. After the first frame of a size it takes no memory, if it is given back what it gave.
