@@ -18,7 +18,7 @@ use nightflow::{
     flow::{Own, convolutions},
     node::{self, Outputs},
     pipeline::{Outcome, Pipeline},
-    wire::{Header, Image},
+    wire::Image,
 };
 
 #[allow(dead_code)]
@@ -54,21 +54,6 @@ impl Source for Memory {
     fn progress(&self) -> Option<f64> {
         Some(self.next as f64 / self.frames as f64)
     }
-}
-
-fn images([width, height]: [u32; 2]) -> Vec<Image> {
-    let of = |seed: u32| Image {
-        header: Header { frame_id: "camera".into(), ..Header::default() },
-        height,
-        width,
-        encoding: "bayer_rggb16".into(),
-        is_bigendian: 0,
-        step: 2 * width,
-        data: (0..height)
-            .flat_map(|y| (0..width).flat_map(move |x| rivals::count(x + 4 * seed, y, 1).to_le_bytes()))
-            .collect(),
-    };
-    (0..4).map(of).collect()
 }
 
 /// Milliseconds a frame, one stage after the other.
@@ -126,7 +111,8 @@ fn report(frames: usize, rounds: usize) -> Result<(), Box<dyn Error>> {
         );
         let config = Config::parse(&text, Path::new("ahead"))?;
         for size in SIZES {
-            let images = Arc::new(images(size));
+            // Moves by four pixels a frame, so that there is something to match.
+            let images = Arc::new((0..4).map(|number| rivals::image(size, 4 * number, 1)).collect::<Vec<_>>());
             let source = || Memory { images: Arc::clone(&images), next: 0, frames };
             let (mut serial, mut node, mut ratios) = (vec![], vec![], vec![]);
             for round in 0..=rounds {

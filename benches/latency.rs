@@ -23,7 +23,7 @@ use nightflow::{
     node::{self, Outputs},
     pipeline::Pipeline,
     publish::{iceoryx2::SharedSink, shared::FlowHeader},
-    wire::{self, Header, Image},
+    wire::{self, Image},
 };
 use zenoh::Wait;
 
@@ -53,20 +53,6 @@ impl Run {
     }
 }
 
-fn image([width, height]: [u32; 2], seed: u32) -> Image {
-    // Moves by four pixels a frame, so that there is something to match.
-    let count = |x: u32, y: u32| rivals::count(x + 4 * seed, y, 1).to_le_bytes();
-    Image {
-        header: Header { frame_id: "camera".into(), ..Header::default() },
-        height,
-        width,
-        encoding: "bayer_rggb16".into(),
-        is_bigendian: 0,
-        step: 2 * width,
-        data: (0..height).flat_map(|y| (0..width).flat_map(move |x| count(x, y))).collect(),
-    }
-}
-
 /// Sends frames at their rate, whatever becomes of them.
 fn shoot(endpoint: &str, topic: &str, size: [u32; 2], frames: usize, hz: f64) -> Outcome<()> {
     let mut config = zenoh::Config::default();
@@ -79,7 +65,8 @@ fn shoot(endpoint: &str, topic: &str, size: [u32; 2], frames: usize, hz: f64) ->
     }
     let session = zenoh::open(config).wait()?;
     let publisher = session.declare_publisher(topic.trim_start_matches('/').to_owned()).wait()?;
-    let mut images: Vec<Image> = (0..ROUND).map(|seed| image(size, seed)).collect();
+    // Moves by four pixels a frame, so that there is something to match.
+    let mut images: Vec<Image> = (0..ROUND).map(|number| rivals::image(size, 4 * number, 1)).collect();
     thread::sleep(Duration::from_secs(1));
     let begin = Instant::now();
     for i in 0..frames {

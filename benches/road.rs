@@ -14,12 +14,12 @@ use nightflow::{
     flow::{Error, Matcher, Model, Network, Raster, Slot, padding::Padded},
     pipeline::{Outcome, Pipeline},
     publish::{Iceoryx2, Moved, iceoryx2::SharedSink},
-    wire::{CameraInfo, Header, Image, Imu, Range},
+    wire::{CameraInfo, Header, Imu, Range},
 };
 
 mod rivals;
 
-use rivals::{BLACK, count, hash, python};
+use rivals::{BLACK, hash, image, python};
 
 const WIDTH: u32 = 1280;
 const HEIGHT: u32 = 1024;
@@ -30,17 +30,7 @@ const STEPS: usize = 400;
 const STEP_NS: i64 = 33_333_333;
 
 fn frame(seed: u32) -> Frame {
-    let bytes = (0..HEIGHT).flat_map(|y| (0..WIDTH).flat_map(move |x| count(x, y, seed).to_le_bytes()));
-    let image = Image {
-        header: Header { frame_id: "camera".into(), ..Header::default() },
-        height: HEIGHT,
-        width: WIDTH,
-        encoding: "bayer_rggb16".into(),
-        is_bigendian: 0,
-        step: 2 * WIDTH,
-        data: bytes.collect(),
-    };
-    Frame { image, received: Stamp::default() }
+    Frame { image: image([WIDTH, HEIGHT], 0, seed), received: Stamp::default() }
 }
 
 fn header(ns: i64) -> Header {

@@ -325,13 +325,11 @@ impl Loop<'_, '_> {
                     self.outputs.sample(&sample);
                     self.cadence.saw(&sample, &mut self.report);
                     if let Some(taken) = self.advance(&sample, read, took) {
-                        self.tell(&Taken { displaced: counts.displaced, ..taken });
+                        self.tell(&taken);
                     }
                 }
                 What::Idle => {}
-                What::Failed(error @ (camera::Error::Torn { .. } | camera::Error::Wire(_))) => {
-                    self.report.spoil("camera", &error);
-                }
+                What::Torn(error) => self.report.spoil("camera", &error),
                 What::Failed(fatal) => return Err(fatal.into()),
             }
             self.status();
@@ -380,7 +378,8 @@ impl Loop<'_, '_> {
                 report.step_ms.keep((took + step).as_secs_f64() * 1e3);
                 report.latency_ms.keep(clock::now().seconds_since(moved.newer) * 1e3);
                 let size = back.image().map_or([1, 1], |image| [image.width, image.height]);
-                return Some(Taken { stamp: moved.newer, displaced: 0, step_s: step.as_secs_f64(), size });
+                let displaced = report.source.displaced;
+                return Some(Taken { stamp: moved.newer, displaced, step_s: step.as_secs_f64(), size });
             }
             Ok(Outcome::Unpaired) => report.unpaired += 1,
             Ok(Outcome::Noted) => {}

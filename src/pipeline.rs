@@ -134,11 +134,6 @@ impl Pipeline {
         self.back.lookout.as_ref()
     }
 
-    /// What camera and gyro disagree on, if they do beyond doubt.
-    pub fn diagnosis(&self) -> Option<Diagnosis> {
-        self.back.diagnosis()
-    }
-
     /// The network that runs.
     pub fn network(&self) -> &Matcher {
         &self.back.flow

@@ -5,6 +5,8 @@ use std::{
     process::Command,
 };
 
+use nightflow::wire::{Header, Image};
+
 /// Black level of the frames.
 pub const BLACK: u32 = 64;
 /// White level of the frames.
@@ -29,6 +31,20 @@ pub fn count(x: u32, y: u32, seed: u32) -> u16 {
         3000
     } else {
         (BLACK + ground + (z & 15) + (z >> 4 & 15) - 15) as u16
+    }
+}
+
+/// The night scene as a raw image, 12 of 16 bits, of a camera that has moved by so many pixels to the right.
+pub fn image([width, height]: [u32; 2], moved: u32, seed: u32) -> Image {
+    let bytes = (0..height).flat_map(|y| (0..width).flat_map(move |x| count(x + moved, y, seed).to_le_bytes()));
+    Image {
+        header: Header { frame_id: "camera".into(), ..Header::default() },
+        height,
+        width,
+        encoding: "bayer_rggb16".into(),
+        is_bigendian: 0,
+        step: 2 * width,
+        data: bytes.collect(),
     }
 }
 

@@ -52,7 +52,9 @@ pub(super) enum What {
     Sample(Sample, Read, Duration),
     /// Nothing came for a while.
     Idle,
-    /// A message that can't be decoded, or a source that can't go on.
+    /// A message that can't be decoded.
+    Torn(camera::Error),
+    /// The source can't go on; nothing follows.
     Failed(camera::Error),
 }
 
@@ -149,10 +151,10 @@ impl Ahead<'_> {
                 Ok(Next::Sample(sample)) => self.sample(sample),
                 Ok(Next::Idle) => self.pass(What::Idle),
                 Ok(Next::End) => return,
-                Err(torn @ (camera::Error::Torn { .. } | camera::Error::Wire(_))) => self.pass(What::Failed(torn)),
+                Err(torn @ (camera::Error::Torn { .. } | camera::Error::Wire(_))) => self.pass(What::Torn(torn)),
                 Err(fatal) => {
                     self.pass(What::Failed(fatal));
-                    return;
+                    false
                 }
             };
             if !goes_on {
