@@ -16,7 +16,7 @@ from torch import nn
 
 import checkpoints
 from flownet import KINDS, FlowNet
-from networks import FACTOR, GAIN, OFFSET, SHIFT, PwcNet
+from networks import FACTOR, GAIN, OFFSET, SHIFT, STRIDE, PwcNet
 from raft import RaftSmall
 
 OPSET = 17
@@ -25,6 +25,8 @@ DOMAIN, DOMAIN_VERSION = "nightflow", 1
 FRAMES = ("older", "newer")
 LARGEST_FILE = 20_000_000
 PARITY_PX = 1e-3
+# What inputs are multiples of where the manifest says nothing else.
+USUAL_STRIDE = 64
 GOLDEN_HEIGHT, GOLDEN_WIDTH = 128, 192
 GOLDEN_ROWS, GOLDEN_COLUMNS = (4, 12, 20, 28), (4, 12, 20, 28, 36, 44)
 GOLDEN_TOLERANCE = 0.02
@@ -437,11 +439,13 @@ def gigamacs(pyramid: Path, decoder: Path) -> float:
     return total / 1e9
 
 
-def manifest_entry(name: str, version: str, files: dict[str, Path], exported: Exported) -> str:
-    """The manifest's tables for one network, with the golden output."""
+def manifest_entry(name: str, version: str, files: dict[str, Path], exported: Exported, stride: int = USUAL_STRIDE) -> str:
+    """The manifest's tables for one network, whose inputs are multiples of `stride`, with the golden output."""
     flow, uncertainty = exported(*golden_frames())
     rows, columns = np.ix_(GOLDEN_ROWS, GOLDEN_COLUMNS)
-    lines = [f"[{name}]", 'kind = "pyramid_decoder"', f"opset = {OPSET}", f'version = "{version}"']
+    lines = [f"[{name}]", 'kind = "pyramid_decoder"', f"opset = {OPSET}"]
+    lines += [f"stride = {stride}"] if stride != USUAL_STRIDE else []
+    lines += [f'version = "{version}"']
     lines += [f"gigamacs = {gigamacs(files['pyramid'], files['decoder']):.3f}"]
     for part, file in files.items():
         lines += [f"[{name}.{part}]", f'file = "{file.name}"']
@@ -506,12 +510,13 @@ def export(arguments: argparse.Namespace, network: nn.Module, state: dict, name:
         files[part].write_bytes(written)
     # The fused graph needs the node's operator: the node's tests compare it with the plain one.
     exported = Exported(str(files["pyramid"]), str(files["decoder"]))
-    for height, width in ((128, 192), (256, 320), (512, 640)):
+    stride = STRIDE if isinstance(network, PwcNet) else USUAL_STRIDE
+    for height, width in ((128, 192), (256, 320), (512, 640), (128 + stride, 192 + stride)):
         worst = parity(rounded(network), exported, *moved(height, width, height))
         print(f"{height}x{width}: graphs and PyTorch differ by at most {worst:.1e} px")
         if worst > PARITY_PX:
             raise SystemExit(f"{height}x{width}: expected graphs within {PARITY_PX} px of PyTorch, got {worst}")
-    entry = manifest_entry(name, arguments.version, files, exported)
+    entry = manifest_entry(name, arguments.version, files, exported, stride)
     write_manifest(arguments.models / "manifest.toml", name, entry)
 
 

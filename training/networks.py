@@ -30,7 +30,10 @@ CONTEXT = ((64, 1), (64, 2), (64, 4), (64, 8), (32, 1))
 REACH, NARROW_REACH = 4, 2
 # The cost volume is a mean of products of unit deviation; the convolutions want it larger.
 GAIN = 4.0
-# Columns a tile of the cost volume has; inputs are multiples of 64 wide, so these divide the levels' widths.
+# Inputs are multiples of this in both directions: the coarsest level has whole cells.
+STRIDE = 2**COARSEST
+# Columns a tile of the cost volume has. They divide the levels' widths where an input is a multiple of 64 wide; elsewhere a
+# row is filled up.
 TILES = {2: 16, 3: 8}
 LEVEL_WEIGHTS = (0.2, 0.3, 0.4, 0.6, 1.0)
 # The encoder's cell i of level n looks at pixel 2^n i; with the frame moved by so many pixels, at 2^n i + SHIFT.
@@ -70,23 +73,29 @@ def cost_volume(older: torch.Tensor, newer: torch.Tensor, tile: int | None, reac
     Rows are cut into tiles of `tile` >= 2 reach columns (None: one tile, the whole row). Each tile is multiplied, as a
     matrix, with the rows around it and a halo of `reach` columns; of the tile x (tile + 2 reach) products the band of
     2 reach + 1 diagonals is wanted. Padding the flattened matrix by `tile` and folding it one column wider turns the
-    diagonals into columns.
+    diagonals into columns. A row that is no whole number of tiles is filled up with zeros, and what they give is cut off.
     """
     batch, channels, height, width = older.shape
     halo = 2 * reach
     side = halo + 1
     span = width if tile is None else tile
-    rows = F.pad(newer, [reach, reach if tile is None else tile - reach, reach, reach]).permute(0, 2, 3, 1)
+    beyond = 0 if tile is None else -width % tile
+    # A traced graph serves every width, not only the one that it is traced at.
+    whole = tile is None or not (torch.jit.is_tracing() or beyond)
+    rows = F.pad(newer, [reach, reach if tile is None else tile - reach + beyond, reach, reach]).permute(0, 2, 3, 1)
     if tile is None:
         rows = rows.unsqueeze(2)
     else:
         chunks = rows.reshape(batch, height + halo, -1, tile, channels)
         rows = torch.cat([chunks[:, :, :-1], chunks[:, :, 1:, :halo]], 3)
     around = torch.stack([rows[:, dy : dy + height] for dy in range(side)], 1)
-    tiles = (older * (1.0 / channels)).permute(0, 2, 3, 1).reshape(batch, 1, height, -1, span, channels)
+    scaled = older * (1.0 / channels)
+    filled = scaled if whole else F.pad(scaled, [0, beyond])
+    tiles = filled.permute(0, 2, 3, 1).reshape(batch, 1, height, -1, span, channels)
     products = torch.matmul(tiles, around.transpose(-1, -2))
     band = F.pad(products.flatten(-2), [0, span]).reshape(batch, side, height, -1, span, span + halo + 1)[..., :side]
-    return band.permute(0, 1, 5, 2, 3, 4).reshape(batch, side * side, height, width)
+    volume = band.permute(0, 1, 5, 2, 3, 4).reshape(batch, side * side, height, width + beyond)
+    return volume if whole else volume[..., :width]
 
 
 def columns(level: int, device: torch.device) -> int | None:

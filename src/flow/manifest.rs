@@ -6,10 +6,10 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use serde::Deserialize;
+use serde::{Deserialize, Deserializer, de::Error as _};
 use sha2::{Digest, Sha256};
 
-use crate::flow::{Error, Precision, network::Golden};
+use crate::flow::{Error, Precision, network::Golden, padding};
 
 /// What the manifest says of a network that comes as a pyramid and a decoder.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -19,6 +19,9 @@ pub struct Entry {
     pub kind: Kind,
     /// ONNX operator set.
     pub opset: u32,
+    /// Rows and columns of its images are multiples of this.
+    #[serde(default = "six_halvings", deserialize_with = "halvings")]
+    pub stride: usize,
     /// The weights' version.
     pub version: String,
     /// The graph that looks at one frame.
@@ -38,6 +41,17 @@ pub struct Entry {
     pub precisions: Vec<Precision>,
     /// What the exporter noted.
     pub golden: Option<Golden>,
+}
+
+fn six_halvings() -> usize {
+    padding::STRIDE
+}
+
+/// A power of two, of which a quarter is a whole number.
+fn halvings<'de, D: Deserializer<'de>>(from: D) -> Result<usize, D::Error> {
+    let found = usize::deserialize(from)?;
+    let fits = found.is_power_of_two() && (4..=padding::STRIDE).contains(&found);
+    if fits { Ok(found) } else { Err(D::Error::custom(format!("stride should be 4, 8, 16, 32 or 64, it is {found}"))) }
 }
 
 impl Entry {

@@ -48,6 +48,7 @@ pub struct Onnx {
     features: Vec<Feature>,
     memory: Option<Memory>,
     scale: Tensor<f32>,
+    stride: usize,
     golden: Option<Golden>,
     model: Model,
     copied: u64,
@@ -322,6 +323,7 @@ impl Onnx {
             features,
             memory: None,
             scale: Tensor::from_array(([2usize], vec![1.0f32, 1.0])).map_err(failed("reserve memory"))?,
+            stride: entry.stride,
             golden: entry.golden,
             model: Model { name: config.network.clone(), version: entry.version, sha256, operators, provider, library },
             copied: 0,
@@ -361,6 +363,10 @@ impl Memory {
 }
 
 impl Network for Onnx {
+    fn stride(&self) -> usize {
+        self.stride
+    }
+
     fn end_profile(&mut self) -> Result<Vec<PathBuf>, Error> {
         let sessions = [&mut self.pyramid.session, &mut self.decoder.session];
         let end = |session: &mut Session| session.end_profiling().map_err(failed("end its record"));

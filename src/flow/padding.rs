@@ -2,7 +2,7 @@
 
 use crate::exposure::Exposed;
 
-/// Sides of the networks' images are multiples of this: six halvings.
+/// Sides of a network's images are multiples of this where it does not say less: six halvings.
 pub const STRIDE: usize = 64;
 
 /// The smallest multiple of `stride` that holds `length`.

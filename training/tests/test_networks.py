@@ -3,12 +3,16 @@
 import pytest
 import torch
 
-from networks import LOOKS, SHIFT, PwcNet, columns, cost_volume, cost_volume_plain, halved, twice
+from networks import LOOKS, SHIFT, STRIDE, PwcNet, columns, cost_volume, cost_volume_plain, halved, twice
 
 
 @pytest.mark.parametrize(
     "shape, tile, reach",
-    [((2, 32, 8, 48), 16, 4), ((2, 8, 6, 24), 8, 4), ((1, 5, 8, 12), None, 4), ((1, 5, 2, 3), None, 4), ((2, 6, 5, 32), 16, 2)],
+    [
+        ((2, 32, 8, 48), 16, 4), ((2, 8, 6, 24), 8, 4), ((1, 5, 8, 12), None, 4), ((1, 5, 2, 3), None, 4), ((2, 6, 5, 32), 16, 2),
+        # Rows that are no whole number of tiles, as where an input is an odd multiple of 32 wide.
+        ((2, 8, 6, 20), 8, 4), ((1, 8, 4, 4), 8, 4), ((2, 6, 5, 40), 16, 2), ((1, 6, 5, 8), 16, 2), ((1, 3, 4, 17), 8, 4),
+    ],
 )
 def test_fast_cost_volume_equals_the_plain_one(shape, tile, reach):
     torch.manual_seed(0)
@@ -38,6 +42,15 @@ def test_cost_volume_peaks_at_the_displacement():
 def biased(name: str) -> bool:
     """Biases that an instance norm takes away."""
     return name.startswith("pyramid.encoder") and name.endswith("bias") or name == "pyramid.quarter.bias"
+
+
+@pytest.mark.parametrize("height, width", [(32, 32), (96, 160)])
+def test_inputs_are_multiples_of_the_stride(height, width):
+    network = PwcNet().eval()
+    with torch.no_grad():
+        flows, expected = network(torch.rand(1, 3, height, width), torch.rand(1, 3, height, width))
+    assert STRIDE == 32 and flows[0].shape == (1, 2, height // STRIDE, width // STRIDE)
+    assert flows[-1].shape == (1, 2, height // 4, width // 4) and expected.shape == (1, 1, height // 4, width // 4)
 
 
 def test_shapes_and_every_parameter_learns():

@@ -6,7 +6,7 @@ use anyhow::{Result, ensure};
 use nightflow::{
     clock,
     exposure::{Exposed, Pair},
-    flow::{self, Config, Graph, Matcher, Own, padding, profile},
+    flow::{self, Config, Graph, Matcher, Own, manifest::Entry, padding, profile},
 };
 
 /// Frames that take turns: three would do for each to be new to the matcher, which keeps two.
@@ -18,8 +18,8 @@ pub fn frames(width: usize, height: usize) -> Rc<[Exposed]> {
 }
 
 /// What the image becomes for the network.
-pub fn padded(width: usize, height: usize) -> [usize; 2] {
-    [width, height].map(|side| padding::padded(side, padding::STRIDE))
+pub fn padded(sides: [usize; 2], entry: &Entry) -> [usize; 2] {
+    sides.map(|side| padding::padded(side, entry.stride))
 }
 
 /// A matcher that gets one new frame a step, as in the node: the pyramid runs once and the decoder once.

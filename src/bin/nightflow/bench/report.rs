@@ -189,10 +189,11 @@ impl Report {
         let over = format!("over {}", size(self.size));
         let title = format!("How the cost of {} grows", self.followed);
         heading(text, &title, &["image", "threads", "ms", "ms per megapixel", &over, "memory, MiB"]);
+        let followed = self.networks.iter().find(|(name, _)| *name == self.followed);
         for &(sides, threads) in &self.sizes {
             let what = What::Sized(sides, threads);
             let (times, base) = (self.growth.of(&what), self.growth.of(&What::Sized(self.size, threads)));
-            let inside = padded(sides[0], sides[1]);
+            let inside = followed.map_or(sides, |(_, entry)| padded(sides, entry));
             let note = if inside == sides { String::new() } else { format!(", continued to {}", size(inside)) };
             let megapixels = (sides[0] * sides[1]) as f64 * 1e-6;
             let _ = writeln!(
@@ -212,11 +213,11 @@ impl Report {
         let columns =
             ["network", "GFLOP of convolutions", "GFLOP/s of the step", "of the product's", "convolutions, ms", &aims];
         heading(text, "How near the processor's limit", &columns);
-        let [width, height] = padded(self.size[0], self.size[1]);
         let product = self.steps.of(&What::Product);
         // 10⁹ operations in a millisecond are 10³ of them in a second.
         let rate = |gigamacs: f64, times: &Times| 2e3 * gigamacs / times.median();
         for (network, entry) in &self.networks {
+            let [width, height] = padded(self.size, entry);
             let gigamacs = entry.gigamacs.map(|noted| noted * (width * height) as f64 / NOTED_AREA);
             for (bits, ours) in [("", self.ours(network)), (", bf16", self.tiles(network))] {
                 if ours.is_none() && !bits.is_empty() {
