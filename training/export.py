@@ -16,12 +16,14 @@ from torch import nn
 
 import checkpoints
 from flownet import KINDS, FlowNet
-from networks import FACTOR, GAIN, OFFSET, SHIFT, STRIDE, PwcNet
+from networks import FACTOR, GAIN, OFFSET, SHIFT, STRIDE, LevelDecoder, PwcNet
 from raft import RaftSmall
 
 OPSET = 17
 # Of operators that are not ONNX's own, and their version.
 DOMAIN, DOMAIN_VERSION = "nightflow", 1
+# The most tensors that the node's `Convolutions` reads as one.
+PARTS_MAX = 8
 FRAMES = ("older", "newer")
 LARGEST_FILE = 20_000_000
 PARITY_PX = 1e-3
@@ -163,7 +165,7 @@ class EncoderLevels(torch.autograd.Function):
         return tuple(found)
 
 
-def convolutions_of(layers: nn.Sequential) -> tuple[list[nn.Conv2d], list[float]]:
+def convolutions_of(layers: nn.Module) -> tuple[list[nn.Conv2d], list[float]]:
     """Its convolutions and what each multiplies negative results with."""
     found = [part for part in layers.modules() if isinstance(part, (nn.Conv2d, nn.LeakyReLU))]
     following = [*found[1:], None]
@@ -172,12 +174,19 @@ def convolutions_of(layers: nn.Sequential) -> tuple[list[nn.Conv2d], list[float]
     return [part for part, _ in both], [slope for _, slope in both]
 
 
-def chained(layers: nn.Sequential, parts: list[torch.Tensor], kept: bool = False, *, bits: int):
+def chained(layers: nn.Module, parts: list[torch.Tensor], kept: bool = False, *, bits: int):
     """What `networks.through` gives, by the one operator; with `kept` also what the layer before the last gives."""
     convolutions, slopes = convolutions_of(layers)
     weights = [tensor for convolution in convolutions for tensor in (convolution.weight, convolution.bias)]
     dilations = [convolution.dilation[0] for convolution in convolutions]
     return Convolutions.apply(bits, len(parts), dilations, slopes, kept, *parts, *weights)
+
+
+def dense_layers(level: LevelDecoder, parts: list[torch.Tensor]):
+    """A dense level's own layers. Where its last convolution would read more parts than the operator takes, all but the cost
+    volume, which are small, become one beforehand."""
+    few = len(parts) + len(level.body) <= PARTS_MAX
+    return LevelDecoder.layers(level, parts if few else [parts[0], torch.cat(parts[1:], 1)])
 
 
 @contextlib.contextmanager
@@ -205,7 +214,9 @@ def fused(network: PwcNet, bits: int = 32):
             older, newer, flow, level.sharpness, level.reach
         )
         layers = lambda parts, level=level: chain(nn.Sequential(level.body, level.predict), parts, kept=True)
-        parts += [(level, "match", match), (level, "layers", layers)]
+        if level.dense:
+            layers = functools.partial(dense_layers, level)
+        parts += [(level, "match", match), (level, "layers", layers), (level, "through", chain)]
     return exchanged(parts)
 
 
@@ -484,9 +495,10 @@ def main() -> None:
         raise SystemExit(f"{arguments.checkpoint}: holds a {state['kind']}; --iterations is for raftsmall, and needed there")
     arguments.models.mkdir(parents=True, exist_ok=True)
     if state["kind"] == "pwcnet":
-        export(arguments, PwcNet(), state, arguments.name)
+        dense = state.get("dense", False)
+        export(arguments, PwcNet(dense=dense), state, arguments.name)
         if arguments.fast:
-            export(arguments, PwcNet(fast=True), state, f"{arguments.name}_fast")
+            export(arguments, PwcNet(fast=True, dense=dense), state, f"{arguments.name}_fast")
     if state["kind"] in KINDS:
         export(arguments, KINDS[state["kind"]](state["width"]), state, arguments.name)
     for iterations in arguments.iterations or []:

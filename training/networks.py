@@ -14,6 +14,8 @@ that four things differ:
 Small heads predict the expected end-point error, which may not disturb the rest. `quality` "fast" ends at level 3.
 """
 
+import itertools
+
 import torch
 import torch.nn.functional as F
 from torch import nn
@@ -50,7 +52,7 @@ def conv(inputs: int, outputs: int, dilation: int = 1, size: int = 3) -> nn.Sequ
     )
 
 
-def through(layers: nn.Sequential, parts: list[torch.Tensor]) -> torch.Tensor:
+def through(layers: nn.Module, parts: list[torch.Tensor]) -> torch.Tensor:
     """Layers that read several tensors as one. One operator in the bf16 graph of export.py."""
     return layers(parts[0] if len(parts) == 1 else torch.cat(parts, 1))
 
@@ -160,19 +162,28 @@ class Pyramid(nn.Module):
 
 
 class LevelDecoder(nn.Module):
-    """Cost volume, convolutions, a residual flow in pixels of this level."""
+    """Cost volume, convolutions, a residual flow in pixels of this level.
 
-    def __init__(self, reach: int, context: int, above: int, widths: tuple[int, ...]):
+    A `dense` one is as Sun et al. 2018 have it: every convolution of its body, and the one that predicts, reads all that there
+    is before it, first what the body reads and then what its convolutions gave, in their order. What it passes on upward is
+    the last convolution's output alone, so that all around it is shaped as without.
+    """
+
+    def __init__(self, reach: int, context: int, above: int, widths: tuple[int, ...], dense: bool = False):
         super().__init__()
         side = 2 * reach + 1
-        self.reach = reach
+        self.reach, self.dense = reach, dense
         widths = (side * side + 2 + context + 2 + above, *widths)
-        self.body = nn.Sequential(*(conv(i, o) for i, o in zip(widths, widths[1:])))
-        self.predict = nn.Conv2d(widths[-1], 3, 3, padding=1)
+        # What each convolution reads, and what the prediction does.
+        read = list(itertools.accumulate(widths)) if dense else widths
+        self.body = nn.Sequential(*(conv(i, o) for i, o in zip(read, widths[1:])))
+        self.predict = nn.Conv2d(read[-1], 3, 3, padding=1)
         self.sharpness = nn.Parameter(torch.tensor(3.0))
         offsets = torch.arange(-reach, reach + 1, dtype=torch.float32)
         dy, dx = torch.meshgrid(offsets, offsets, indexing="ij")
         self.register_buffer("offsets", torch.stack([dx.flatten(), dy.flatten()]), persistent=False)
+        # What export.py exchanges for an operator of the node's own.
+        self.through = through
 
     def match(self, older, newer, flow, tile, fetch):
         """GAIN times the cost volume around the flow, and its soft arg-max. One operator in the fused graph of export.py."""
@@ -183,7 +194,12 @@ class LevelDecoder(nn.Module):
         return volume * GAIN, torch.einsum("bdyx,cd->bcyx", weights, self.offsets)
 
     def layers(self, parts):
-        """The residual in fp32, and the body's features. One operator in the bf16 graph of export.py."""
+        """The residual in fp32, and the body's features. One operator in the bf16 graph of export.py, of a dense body one for
+        each convolution."""
+        if self.dense:
+            for layer in self.body:
+                parts = [*parts, self.through(layer, parts)]
+            return self.through(self.predict, parts).float(), parts[-1]
         features = through(self.body, parts)
         return self.predict(features).float(), features
 
@@ -209,14 +225,14 @@ class Decoder(nn.Module):
     the expected errors are a list, of the last two flows at their own levels.
     """
 
-    def __init__(self):
+    def __init__(self, dense: bool = False):
         super().__init__()
-        self.shared = LevelDecoder(REACH, CONTEXT_CHANNELS, DECODER_CHANNELS[-1], DECODER_CHANNELS)
+        self.shared = LevelDecoder(REACH, CONTEXT_CHANNELS, DECODER_CHANNELS[-1], DECODER_CHANNELS, dense)
         widths = (DECODER_CHANNELS[-1] + 2, *(c for c, _ in CONTEXT))
         self.context = nn.Sequential(
             *(conv(i, o, dilation=d) for i, (o, d) in zip(widths, CONTEXT)), nn.Conv2d(widths[-1], 2, 3, padding=1)
         )
-        self.fine = LevelDecoder(NARROW_REACH, QUARTER, DECODER_CHANNELS[-1], NARROW_CHANNELS)
+        self.fine = LevelDecoder(NARROW_REACH, QUARTER, DECODER_CHANNELS[-1], NARROW_CHANNELS, dense)
         self.error, self.fast_error = error_head(), error_head()
         # What export.py exchanges for operators of the node's own, or for ONNX's that PyTorch does not have.
         self.through, self.halved, self.twice = through, halved, twice
@@ -247,17 +263,17 @@ class Decoder(nn.Module):
 
 
 class PwcNet(nn.Module):
-    """Pyramid and decoder together, as they are trained."""
+    """Pyramid and decoder together, as they are trained; with `dense` connections in the levels' decoders if so wanted."""
 
     # Scalars that have a long way to go.
     FAST = ("sharpness",)
     # Published weights, which need no more than a touch.
     SLOW = ("pyramid.encoder.",)
 
-    def __init__(self, fast: bool = False):
+    def __init__(self, fast: bool = False, dense: bool = False):
         super().__init__()
         self.fast = fast
-        self.pyramid, self.decoder = Pyramid(), Decoder()
+        self.pyramid, self.decoder = Pyramid(), Decoder(dense)
         for module in (self.pyramid.quarter, self.pyramid.context, self.decoder):
             for part in module.modules():
                 if isinstance(part, nn.Conv2d):

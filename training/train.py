@@ -29,7 +29,7 @@ def network_of(description: dict) -> nn.Module:
     """The network that a run's TOML describes, untrained but for published weights that it starts from."""
     kind = description["network"]
     if kind == "pwcnet":
-        return PwcNet()
+        return PwcNet(dense=description.get("dense", False))
     if kind == "raftsmall":
         return RaftSmall(description["iterations"])
     if kind in KINDS:
@@ -245,6 +245,7 @@ class Run:
             "random": torch.get_rng_state(),
             "kind": self.description["network"],
             "width": self.description.get("width"),
+            "dense": self.description.get("dense", False),
             "step": self.step,
             "seconds": self.seconds,
         }

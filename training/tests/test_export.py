@@ -10,17 +10,24 @@ import onnxruntime
 import pytest
 import torch
 
+import checkpoints
+import dense
 import int8
-from export import (GOLDEN_COLUMNS, GOLDEN_ROWS, OPSET, USUAL_STRIDE, Exported, gigamacs, golden_frames, graphs_of,
+from export import (GOLDEN_COLUMNS, GOLDEN_ROWS, OPSET, PARTS_MAX, USUAL_STRIDE, Exported, gigamacs, golden_frames, graphs_of,
                     halved_as_one, manifest_entry, moved, parity, rounded, traced, twice_as_one, write_manifest)
 from flownet import FlowNetS
-from networks import PwcNet, halved, twice
+from networks import STRIDE, PwcNet, halved, twice
 from raft import RaftSmall
 
 MODELS = Path(__file__).parents[2] / "models"
 
 
-NETWORKS = {"pwcnet": PwcNet, "fast": lambda: PwcNet(fast=True), "raft": lambda: RaftSmall(2)}
+NETWORKS = {
+    "pwcnet": PwcNet,
+    "fast": lambda: PwcNet(fast=True),
+    "dense": lambda: PwcNet(dense=True),
+    "raft": lambda: RaftSmall(2),
+}
 
 
 @pytest.fixture(scope="module", params=NETWORKS)
@@ -131,16 +138,47 @@ def test_the_bf16_graphs_are_called_alike_and_convolve_by_their_operators(fresh)
             assert np.allclose(view.pop("slopes"), [1.0, 0.1]) and view == {"factor": 2.0, "offset": -1.0, "shift": 2}
             continue
         assert set(given) == {"CostVolume", "Convolutions"}
-        # Levels 5, 4, 3 and 3 again, the context network, level 2, a head for the expected error.
-        assert len(chains) == (6 if network.fast else 7)
         of = lambda node, name: next(onnx.helper.get_attribute_value(a) for a in node.attribute if a.name == name)
-        assert [of(node, "parts") for node in chains[:5]] == [5, 5, 5, 5, 2]
-        assert of(chains[4], "dilations") == [1, 2, 4, 8, 1, 1]
-        assert np.allclose(of(chains[0], "slopes"), [0.1] * 5 + [1.0])
+        parts, layers = [of(node, "parts") for node in chains], [len(of(node, "slopes")) for node in chains]
+        # Levels 5, 4, 3 and 3 again, the context network, level 2, a head for the expected error.
+        if network.decoder.shared.dense:
+            # What a shared body reads beside the volume is one part, or its last convolutions would read too many.
+            assert parts == 4 * [2, 3, 4, 5, 6, 7] + [2] + [5, 6, 7, 8] + [1]
+            assert layers == 24 * [1] + [6] + 4 * [1] + [2] and all(len(node.output) == 1 for node in chains)
+            assert [of(node, "slopes") == [1.0] for node in chains[:6]] == [False] * 5 + [True]
+        else:
+            assert parts == [5, 5, 5, 5, 2] + ([1] if network.fast else [5, 1])
+            assert np.allclose(of(chains[0], "slopes"), [0.1] * 5 + [1.0])
+        assert max(parts) <= PARTS_MAX
+        dilations = [of(node, "dilations") for node in chains]
+        assert [given for given in dilations if set(given) != {1}] == [[1, 2, 4, 8, 1, 1]]
         for node in chains:
             assert len(node.input) == of(node, "parts") + 2 * len(of(node, "slopes"))
     # Nothing of the tracing stays with the network.
     network(*(torch.rand(1, 3, 64, 64) for _ in range(2)))[0][-1].sum().backward()
+
+
+@pytest.mark.parametrize("name", ["pwcnet_fcdn", "pwcnet_fcdn_fast"])
+def test_the_committed_graphs_are_those_of_their_weights(name):
+    """What is added to a network leaves its committed graphs as they are."""
+    network = PwcNet(fast=name.endswith("_fast")).eval()
+    network.load_state_dict(checkpoints.of_graphs(MODELS / "pwcnet_fcdn"))
+    graphs = graphs_of(network)
+    for part, file in (("decoder", "decoder"), ("fused", "decoder_fused"), ("decoder_bf16", "decoder_bf16")):
+        assert graphs[part].graph == onnx.load(MODELS / f"{name}_{file}.onnx").graph, part
+
+
+def test_an_untrained_dense_network_comes_with_a_manifest(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["dense.py", "--to", str(tmp_path / "dense")])
+    dense.main()
+    manifest = tomllib.loads((tmp_path / "dense" / "manifest.toml").read_text())
+    entry = manifest.pop("pwcnet_dense")
+    assert not manifest and entry["precisions"] == ["bf16"] and entry["stride"] == STRIDE
+    assert {"pyramid", "decoder", "fused", "pyramid_bf16", "decoder_bf16", "golden"} <= set(entry)
+    assert 0 < max(map(abs, entry["golden"]["flow"])) < 8 and max(entry["golden"]["uncertainty"]) < 8
+    assert entry["gigamacs"] == pytest.approx(5.870, abs=1e-3)
+    with pytest.raises(SystemExit, match="without a manifest"):
+        dense.main()
 
 
 @pytest.mark.parametrize("plain, one", [(twice, twice_as_one), (halved, halved_as_one)])

@@ -53,9 +53,10 @@ def test_inputs_are_multiples_of_the_stride(height, width):
     assert flows[-1].shape == (1, 2, height // 4, width // 4) and expected.shape == (1, 1, height // 4, width // 4)
 
 
-def test_shapes_and_every_parameter_learns():
+@pytest.mark.parametrize("dense", [False, True])
+def test_shapes_and_every_parameter_learns(dense):
     torch.manual_seed(0)
-    network = PwcNet()
+    network = PwcNet(dense=dense)
     flows, expected = network(torch.rand(2, 3, 64, 128), torch.rand(2, 3, 64, 128))
     levels = [level for level, looks in LOOKS.items() for _ in range(looks)] + [2]
     assert [tuple(f.shape) for f in flows] == [(2, 2, 64 >> level, 128 >> level) for level in levels]
@@ -64,6 +65,29 @@ def test_shapes_and_every_parameter_learns():
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None and parameter.grad.isfinite().all(), name
         assert biased(name) or parameter.grad.abs().sum() > 0, name
+
+
+def test_a_dense_body_reads_all_that_came_before():
+    torch.manual_seed(0)
+    plain, dense = PwcNet().decoder, PwcNet(dense=True).decoder
+    # Volume, arg-max, context, flow, what is above; then what each convolution gave.
+    read = lambda level: [layer.in_channels for layer in (*(unit[0] for unit in level.body), level.predict)]
+    assert read(plain.shared) == [181, 128, 128, 96, 64, 32] and read(plain.fine) == [93, 64, 64, 32]
+    assert read(dense.shared) == [181, 309, 437, 533, 597, 629] and read(dense.fine) == [93, 157, 221, 253]
+    level, parts = dense.fine, [torch.randn(1, count, 4, 6) for count in (25, 2, 32, 2, 32)]
+    found, features = level.layers(parts)
+    seen = torch.cat(parts, 1)
+    for layer in level.body:
+        seen = torch.cat([seen, layer(seen)], 1)
+    assert torch.equal(found, level.predict(seen)) and torch.equal(features, seen[:, -32:])
+    # Else nothing differs, so that all around the levels is shaped alike.
+    shapes = lambda decoder: {n: v.shape for n, v in decoder.state_dict().items() if "body" not in n and "predict" not in n}
+    assert shapes(plain) == shapes(dense)
+
+
+def test_dense_connections_double_the_parameters():
+    count = lambda network: sum(parameter.numel() for parameter in network.parameters())
+    assert (count(PwcNet()), count(PwcNet(dense=True))) == (885_644, 1_887_218)
 
 
 @pytest.mark.parametrize("fast", [False, True])

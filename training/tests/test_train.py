@@ -39,6 +39,18 @@ def steps(run: Run, textures: Textures, count: int) -> None:
         run.train_step(*batch_of(textures, crop["height"], crop["width"], run.noise(crop["batch"])))
 
 
+def test_a_dense_network_is_trained_where_a_run_says_so(packed, tmp_path):
+    run = Run(DESCRIPTION | {"dense": True})
+    assert run.network.decoder.shared.dense and not Run(DESCRIPTION).network.decoder.shared.dense
+    before = run.network.decoder.shared.predict.weight.clone()
+    steps(run, Textures(packed, held_out=False), 1)
+    assert not torch.equal(run.network.decoder.shared.predict.weight, before)
+    run.save(tmp_path / "checkpoint")
+    state = checkpoints.load(tmp_path / "checkpoint")
+    assert state["dense"]
+    PwcNet(dense=True).load_state_dict(state["mean"])
+
+
 @pytest.mark.parametrize("network", ["pwcnet", "raftsmall"])
 def test_a_run_starts_from_the_graphs_of_a_network(network):
     name = Path(__file__).parents[2] / "models" / f"{network}_fcdn"
@@ -109,7 +121,7 @@ def test_every_description_makes_a_run(description):
     known = tomllib.loads(description.read_text())
     leg = {"start"} if description.stem.endswith("_leg") else set()
     own = {"pwcnet": {"start"}, "raftsmall": {"iterations", "start"}}.get(known["network"], {"width"} | leg)
-    extra = {"darkest", "towards_bright", "displacements", "recipe", "bank", "shapes", "apart", "ahead", "only", "pixels", "graph"}
+    extra = {"dense", "darkest", "towards_bright", "displacements", "recipe", "bank", "shapes", "apart", "ahead", "only", "pixels", "graph"}
     assert set(known) - extra == set(DESCRIPTION) | own, "the same keys as every run"
     known.pop("start", None)
     run = Run(known)
