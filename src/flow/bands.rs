@@ -16,30 +16,52 @@ pub struct Bands<'a, T> {
     width: usize,
     /// Rows of a band; the last may have fewer.
     rows: usize,
+    /// Values of a row that a band has; the last of those rows may have fewer.
+    columns: usize,
     taken: AtomicU64,
     memory: PhantomData<&'a mut [T]>,
 }
 
-// SAFETY: what a thread gets are bands, each handed out once, and no two bands share a row.
+// SAFETY: what a thread gets are bands, each handed out once, and no two bands share a value.
 unsafe impl<T: Send> Sync for Bands<'_, T> {}
 
 impl<'a, T> Bands<'a, T> {
     /// Cuts `memory` into bands of so many rows, at most [`MOST`] of them.
-    pub fn new(memory: &'a mut [T], [planes, height, width]: [usize; 3], rows: usize) -> Self {
+    pub fn new(memory: &'a mut [T], shape: [usize; 3], rows: usize) -> Self {
+        let columns = shape[2];
+        Self::tiled(memory, shape, [rows, columns])
+    }
+
+    /// Cuts `memory` into bands of so many rows, and each of those into bands of so many columns, at most [`MOST`] in all. Those of
+    /// the first columns come first.
+    pub fn tiled(memory: &'a mut [T], [planes, height, width]: [usize; 3], [rows, columns]: [usize; 2]) -> Self {
+        let count = height.div_ceil(rows.max(1)) * width.div_ceil(columns.max(1));
         assert!(
-            planes * height * width <= memory.len() && height <= MOST * rows,
-            "{planes} × {height} × {width}, {rows}"
+            planes * height * width <= memory.len() && count <= MOST && (height == 0 || rows > 0),
+            "{planes} × {height} × {width}, {rows} × {columns}"
         );
-        Self { start: memory.as_mut_ptr(), planes, height, width, rows, taken: AtomicU64::new(0), memory: PhantomData }
+        let (start, taken) = (memory.as_mut_ptr(), AtomicU64::new(0));
+        Self { start, planes, height, width, rows, columns, taken, memory: PhantomData }
+    }
+
+    fn band(&self, number: usize) -> Option<Band<'_, T>> {
+        let down = self.height.div_ceil(self.rows.max(1)).max(1);
+        let (first, left) = (number % down * self.rows, (number / down).checked_mul(self.columns)?);
+        // Rows of no columns are handed out too.
+        let is_there = first < self.height && (left < self.width || number < down);
+        is_there.then(|| {
+            let (end, right) = ((first + self.rows).min(self.height), (left + self.columns).min(self.width));
+            Band { bands: self, first, end, left, right }
+        })
     }
 
     /// The band of this number; nothing if there is none or somebody has it already.
     pub fn take(&self, number: usize) -> Option<Band<'_, T>> {
-        let first = number.checked_mul(self.rows).filter(|first| *first < self.height)?;
+        let band = self.band(number)?;
         let bit = 1 << number;
         // Nothing else is told by this bit than whose the band is.
         let taken = self.taken.fetch_or(bit, Ordering::Relaxed) & bit != 0;
-        (!taken).then_some(Band { bands: self, first, end: (first + self.rows).min(self.height) })
+        (!taken).then_some(band)
     }
 }
 
@@ -51,10 +73,9 @@ impl<T> Bands<'_, T> {
             // Sees all that whoever let go of the band wrote to it.
             let taken = self.taken.load(Ordering::Acquire);
             let number = taken.trailing_ones();
-            let first = (number as usize).checked_mul(self.rows).filter(|first| *first < self.height)?;
+            let band = self.band(number as usize)?;
             let (bit, order) = (1u64.checked_shl(number)?, Ordering::Acquire);
             if self.taken.compare_exchange_weak(taken, taken | bit, order, Ordering::Relaxed).is_ok() {
-                let band = Band { bands: self, first, end: (first + self.rows).min(self.height) };
                 return Some(Lent { band, bit });
             }
         }
@@ -80,24 +101,29 @@ impl<T> Drop for Lent<'_, T> {
     }
 }
 
-/// Some rows of every plane.
+/// Some rows of every plane, or some columns of them.
 pub struct Band<'a, T> {
     bands: &'a Bands<'a, T>,
     /// Its first row.
     pub first: usize,
     /// The row after its last.
     pub end: usize,
+    /// Its first column.
+    pub left: usize,
+    /// The column after its last.
+    pub right: usize,
 }
 
 impl<T> Band<'_, T> {
-    /// A row of a plane.
+    /// A row of a plane, from the band's first column to its last.
     #[inline(always)]
     pub fn row(&mut self, plane: usize, row: usize) -> &mut [T] {
         let Bands { start, planes, height, width, .. } = *self.bands;
         assert!(plane < planes && row >= self.first && row < self.end);
-        // SAFETY: the row lies within the memory that `Bands::new` borrowed for good and measured; it belongs to this band
-        // alone, which was handed out once and is borrowed here.
-        unsafe { std::slice::from_raw_parts_mut(start.add((plane * height + row) * width), width) }
+        let (first, length) = ((plane * height + row) * width + self.left, self.right - self.left);
+        // SAFETY: the columns of the row lie within the memory that `Bands::tiled` borrowed for good and measured; they belong to
+        // this band alone, which was handed out once and is borrowed here.
+        unsafe { std::slice::from_raw_parts_mut(start.add(first), length) }
     }
 }
 
@@ -122,6 +148,25 @@ mod tests {
         assert!(bands.take(3).is_none() && bands.take(usize::MAX).is_none());
         assert_eq!(memory[..15], [0.0; 15]);
         assert_eq!(memory[15..], [0., 0., 0., 1., 1., 1., 2., 2., 2., 3., 3., 3., 4., 4., 4.]);
+    }
+
+    #[test]
+    fn columns_are_handed_out_apart() {
+        let mut memory = vec![0; 2 * 3 * 5];
+        let bands = Bands::tiled(&mut memory, [2, 3, 5], [2, 3]);
+        for number in 0..4 {
+            let mut band = bands.take(number).unwrap();
+            let lengths = [band.end - band.first, band.right - band.left];
+            assert_eq!(lengths, [[2, 3], [1, 3], [2, 2], [1, 2]][number]);
+            for row in band.first..band.end {
+                assert_eq!(band.row(1, row).len(), lengths[1]);
+                band.row(1, row).fill(number + 1);
+            }
+            assert!(bands.take(number).is_none());
+        }
+        assert!(bands.take(4).is_none());
+        assert_eq!(memory[15..], [1, 1, 1, 3, 3, 1, 1, 1, 3, 3, 2, 2, 2, 4, 4]);
+        assert_eq!(memory[..15], [0; 15]);
     }
 
     #[test]

@@ -19,7 +19,7 @@ const CHAIN: &str = "Convolutions";
 const ENCODER: &str = "Encoder";
 /// Smaller pictures than this are not worth waking other threads for, in 16 bits and in 32.
 const CELLS_SPREAD_MIN: usize = 512;
-const CELLS_SPREAD_MIN_WIDE: usize = 64;
+const CELLS_SPREAD_MIN_WIDE: usize = 16;
 /// The most tensors that are read as one.
 const PARTS_MAX: usize = 8;
 /// The farthest apart that weights may lie.

@@ -96,7 +96,7 @@ impl Chain {
         for (index, map) in self.maps.iter_mut().enumerate() {
             let Some(layer) = self.layers.get(index) else { break };
             map.resize([layer.inputs(), height, width], layer.margins());
-            bands = bands.max(height.div_ceil(layer.band([height, width])));
+            bands = bands.max(layer.bands([height, width]));
             each = each.max(layer.scratch([height, width]));
         }
         if let (Some(map), Some(layer)) = (self.maps.last_mut(), self.layers.last()) {
@@ -118,12 +118,12 @@ fn convolve<E>(
     spread: &impl Spread<E>,
 ) -> Result<(), E> {
     let [_, height, width] = from.shape;
-    let rows = layer.band([height, width]);
-    let (before, depth, bands) = (to.margins[0], to.depth(), height.div_ceil(rows));
-    let (to, own) = (to.cut(rows), own.cut());
-    spread(bands, &|number| {
+    let size = [height, width];
+    let (before, across) = (to.margins[0], to.stride() / to.depth());
+    let (to, own) = (to.tiled([layer.band(size), layer.part(size)]), own.cut());
+    spread(layer.bands(size), &|number| {
         if let (Some(to), Some(mut own)) = (to.take(number), own.lend()) {
-            unit.run(Convolve { layer, from, before, depth, scratch: own.row(), to });
+            unit.run(Convolve { layer, from, before, across, scratch: own.row(), to });
         }
     })
 }

@@ -27,6 +27,8 @@ const TILES: usize = 24;
 /// About how many bands a picture is cut into, and the least tiles of one: weights are fetched once for each.
 const BANDS: usize = 8;
 const TILES_LEAST: usize = 16;
+/// Outputs are cut at multiples of this, for so many are multiplied at once.
+const PART: usize = 32;
 
 /// A convolution of 3 × 3 that keeps the size, with zeros around its input.
 #[derive(Debug)]
@@ -87,15 +89,26 @@ impl Layer {
     /// Rows of a band for a picture of so many rows and columns.
     pub fn band(&self, [height, width]: [usize; 2]) -> usize {
         let group = OUT * self.dilation;
-        let (groups, tiles) = (height.div_ceil(group), self.dilation * width.div_ceil(OUT));
+        let (groups, tiles) = (height.div_ceil(group).max(1), self.dilation * width.div_ceil(OUT).max(1));
         let rows = groups.div_ceil(BANDS).max(TILES_LEAST.div_ceil(tiles));
-        group * rows.min(groups.div_ceil(2))
+        group * groups.div_ceil(groups.div_ceil(rows))
+    }
+
+    /// Outputs of a band: half of them where the rows are one band, too few or too far apart for more, else all.
+    pub fn part(&self, size: [usize; 2]) -> usize {
+        let outputs = self.bias.len();
+        if self.band(size) < size[0] { outputs } else { outputs.div_ceil(2).next_multiple_of(PART).min(outputs) }
+    }
+
+    /// How many bands there are, by rows and by outputs.
+    pub fn bands(&self, size: [usize; 2]) -> usize {
+        size[0].div_ceil(self.band(size)) * self.bias.len().div_ceil(self.part(size))
     }
 
     /// Values that a band needs for itself.
     pub fn scratch(&self, [height, width]: [usize; 2]) -> usize {
         let tiles = self.tiles([height, width]);
-        PLACES * (room(tiles, self.inputs.next_multiple_of(LINE)) + room(tiles, self.bias.len()))
+        PLACES * (room(tiles, self.inputs.next_multiple_of(LINE)) + room(tiles, self.part([height, width])))
     }
 
     /// How many tiles of such a picture are transformed at once: [`TILES`], or all of a band.
@@ -174,11 +187,12 @@ impl Work for Prepare<'_> {
 pub struct Convolve<'a> {
     pub layer: &'a Layer,
     pub from: &'a Pixels,
-    /// Columns before the picture in the output, and values of its pixels.
+    /// Columns before the picture in the output, and columns with those and with those behind it.
     pub before: usize,
-    pub depth: usize,
+    pub across: usize,
     /// [`Layer::scratch`] values.
     pub scratch: &'a mut [f32],
+    /// A row of channels for each pixel.
     pub to: Band<'a, f32>,
 }
 
@@ -187,12 +201,13 @@ impl Work for Convolve<'_> {
     fn on<L: Lanes>(mut self, lanes: L) {
         let (layer, [_, height, width]) = (self.layer, self.from.shape);
         let across = layer.firsts(width);
-        let begin = layer.firsts(self.to.first);
-        let all = (layer.firsts(self.to.end) - begin) * across;
+        let begin = layer.firsts(self.to.first / self.across);
+        let all = (layer.firsts(self.to.end / self.across) - begin) * across;
         let most = layer.tiles([height, width]);
         let parts = all.div_ceil(most).max(1);
         let some = all.div_ceil(parts).next_multiple_of(STEP).min(most);
-        let (inputs, outputs) = (self.from.depth(), layer.bias.len());
+        let (inputs, [first, end]) = (self.from.depth(), [self.to.left, self.to.right]);
+        let outputs = end - first;
         let (seen, results) = std::mem::take(&mut self.scratch).split_at_mut(PLACES * room(some, inputs));
         for start in (0..all).step_by(some) {
             let count = some.min(all - start);
@@ -203,7 +218,8 @@ impl Work for Convolve<'_> {
             for tile in 0..count {
                 self.look(lanes, place(tile), tile, some, seen);
             }
-            let panels = layer.weights[skipped(&layer.weights)..].chunks_exact(layer.inputs * outputs).take(PLACES);
+            let places = layer.weights[skipped(&layer.weights)..].chunks_exact(layer.inputs * layer.bias.len());
+            let panels = places.take(PLACES).map(|weights| &weights[layer.inputs * first..layer.inputs * end]);
             let (seen, stride) = (&*seen, room(some, outputs));
             for (number, weights) in panels.enumerate() {
                 let tiles = seen[number * room(some, inputs)..].as_chunks().0;
@@ -271,8 +287,9 @@ impl Convolve<'_> {
     #[inline(always)]
     fn finish<L: Lanes>(&mut self, lanes: L, [y, x]: [usize; 2], from: &[f32], room: usize) {
         let Layer { dilation, slope, bias, .. } = self.layer;
-        let (slope, width) = (lanes.splat(*slope), self.from.shape[2]);
-        for c in (0..self.depth).step_by(L::COUNT) {
+        let (slope, width, bottom) = (lanes.splat(*slope), self.from.shape[2], self.to.end / self.across);
+        let bias = &bias[self.to.left..self.to.right];
+        for c in (0..bias.len()).step_by(L::COUNT) {
             let mut rows = [[lanes.splat(0.0); OUT]; IN];
             for (i, row) in rows.iter_mut().enumerate() {
                 let mut values = [lanes.splat(0.0); IN];
@@ -285,10 +302,10 @@ impl Convolve<'_> {
             for (j, column) in turned(rows).into_iter().enumerate() {
                 for (i, value) in finished(lanes, column).into_iter().enumerate() {
                     let (y, x) = (y + i * dilation, x + j * dilation);
-                    if y < self.to.end && x < width {
+                    if y < bottom && x < width {
                         let value = lanes.add(value, bias);
                         let value = lanes.max(value, lanes.mul(slope, value));
-                        lanes.store(value, &mut self.to.row(0, y)[(self.before + x) * self.depth + c..]);
+                        lanes.store(value, &mut self.to.row(0, y * self.across + self.before + x)[c..]);
                     }
                 }
             }

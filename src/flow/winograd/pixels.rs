@@ -57,6 +57,15 @@ impl Pixels {
         let picture = &mut self.values[self.skipped..][before * stride..][..height * stride];
         Bands::new(picture, [1, height, stride], rows)
     }
+
+    /// Its pixels, each a row of channels and those of margins left and right among them, in bands of so many of the picture's rows
+    /// and so many channels.
+    pub fn tiled(&mut self, [rows, channels]: [usize; 2]) -> Bands<'_, f32> {
+        let (stride, depth, before, height) = (self.stride(), self.depth(), self.margins[0], self.shape[1]);
+        let across = stride / depth;
+        let picture = &mut self.values[self.skipped..][before * stride..][..height * stride];
+        Bands::tiled(picture, [1, height * across, depth], [rows * across, channels])
+    }
 }
 
 /// Some rows of planes, which are read as if they were one tensor after the other, become pixels.
