@@ -92,6 +92,8 @@ pub struct Config {
     pub resolution: Resolution,
     /// Move the network's vectors to where the images' gradients want them.
     pub refine: bool,
+    /// Refine columns of cells by themselves, so that a pole is told from what is behind it.
+    pub refine_narrow: bool,
     /// Frames further apart than this are no pair.
     pub gap_ms_max: f64,
     /// Run the network once at start and compare with the values that its exporter noted.
@@ -127,6 +129,7 @@ impl Default for Config {
             precision: Precision::Fp32,
             resolution: Resolution::Quarter,
             refine: true,
+            refine_narrow: false,
             gap_ms_max: 150.0,
             golden_check: true,
             noise_level_max: 75.0,
@@ -174,6 +177,11 @@ pub const REASONS: &[(&str, &str)] = &[
         "refine",
         "true: gradients know to hundredths of a pixel what a network knows to a tenth; speeds err by half as much \
          (models/velocity.md)",
+    ),
+    (
+        "refine_narrow",
+        "false: on a plane, as the ground is, wider windows know more; a camera that looks for obstacles wants it, whose times to \
+         contact err by half as much at poles (models/obstacles.md)",
     ),
     ("gap_ms_max", "150: four lost frames at 30 Hz; beyond, a drone's motion leaves the reach of the cost volumes"),
     ("golden_check", "a runtime that computes something else is found at start, for the price of one small pair"),

@@ -76,7 +76,7 @@ impl Matcher {
         Self {
             config: config.clone(),
             network,
-            refiner: Refiner::default(),
+            refiner: Refiner::new(config.refine_narrow),
             described: [None; 2],
             flow: vec![],
             uncertainty: vec![],

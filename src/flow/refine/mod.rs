@@ -12,7 +12,7 @@
 //! - The products are summed over windows of ever larger size. What the larger window says is what the smaller one
 //!   believes beforehand: flat cells and dark ones take the correction of what lies around them, at most that, and the
 //!   largest window believes the network. Errors of a network are alike over many cells, and many cells know what one
-//!   does not.
+//!   does not. Where narrow things matter, the smallest window may be a column of cells.
 //! - Two rounds, each at the place that the one before found. A cell whose frames are no more alike after the first round
 //!   than before keeps the network's vector.
 
@@ -57,6 +57,9 @@ pub(super) struct Refiner {
     warp: sums::Warp,
     cells: Sums,
     window: Sums,
+    /// Whether there are columns, and their sums.
+    narrow: bool,
+    column: Sums,
     levels: Vec<Level>,
 }
 
@@ -91,6 +94,11 @@ impl Grey {
 }
 
 impl Refiner {
+    /// With or without columns.
+    pub(super) fn new(narrow: bool) -> Self {
+        Self { narrow, ..Self::default() }
+    }
+
     /// Moves the vectors of `flow` (in camera pixels, on a raster of `columns`) and lowers their expected errors.
     pub(super) fn refine(&mut self, pair: &Pair<'_>, columns: usize, flow: &mut [f32], uncertainty: &mut [f32]) {
         let size = [pair.older.width, pair.older.height];
@@ -114,7 +122,11 @@ impl Refiner {
                 withdraw(&self.window, &mut self.before, &mut self.change);
             }
             pyramid::halve(&self.cells, &mut self.levels);
-            pyramid::descend(&mut self.levels, &self.window, &mut self.change, &mut self.variance);
+            let columns = self.narrow.then(|| {
+                pyramid::stand(&self.cells, &mut self.column);
+                &self.column
+            });
+            pyramid::descend(&mut self.levels, &self.window, columns, &mut self.change, &mut self.variance);
         }
         self.conclude(raster, columns, pair.older.scale, flow, uncertainty);
     }

@@ -8,6 +8,8 @@ const LEVELS: usize = 5;
 const TOP: f32 = 1.0;
 /// How far the correction of a smaller window may be from that of the larger one, as such a part.
 const LOCAL: f32 = 1.0;
+/// Weights of the cells of a column, the middle one's first: (1 8 28 56 70 56 28 8 1)/70.
+const COLUMN: [f32; 5] = [1.0, 56.0 / 70.0, 28.0 / 70.0, 8.0 / 70.0, 1.0 / 70.0];
 /// No correction is longer, pixels: the gradients know no further.
 const REACH: f32 = 1.0;
 /// A variance that stands for knowing nothing, pixels².
@@ -114,6 +116,27 @@ pub(super) fn smooth(from: &Sums, into: &mut Sums) {
     }
 }
 
+/// The cells' columns, one cell wide: what stands before something far away is often no wider, and a window that is would have what
+/// is behind it say that the network, which draws narrow things to what is behind them, is right.
+pub(super) fn stand(from: &Sums, into: &mut Sums) {
+    let (width, height) = (from.width, from.height);
+    into.size([width, height]);
+    let both = from.planes.chunks_exact(width * height).zip(into.planes.chunks_exact_mut(width * height));
+    for (from, into) in both {
+        for (y, out) in into.chunks_exact_mut(width).enumerate() {
+            let row = |y: usize| &from[y.min(height - 1) * width..][..width];
+            for (value, here) in out.iter_mut().zip(row(y)) {
+                *value = COLUMN[0] * here;
+            }
+            for (off, weight) in COLUMN.iter().enumerate().skip(1) {
+                for (value, (up, down)) in out.iter_mut().zip(row(y.saturating_sub(off)).iter().zip(row(y + off))) {
+                    *value += weight * (up + down);
+                }
+            }
+        }
+    }
+}
+
 /// A larger window's sums and what they say.
 #[derive(Debug, Default)]
 pub(super) struct Level {
@@ -157,29 +180,50 @@ pub(super) fn halve(cells: &Sums, levels: &mut Vec<Level>) {
     }
 }
 
-/// From the largest window, which believes the network, down to the cells' own.
-pub(super) fn descend(levels: &mut [Level], cells: &Sums, change: &mut [f32], variance: &mut [f32]) {
+/// From the largest window, which believes the network, down to the cells' own, and on to their columns where there are any.
+pub(super) fn descend(
+    levels: &mut [Level],
+    cells: &Sums,
+    columns: Option<&Sums>,
+    change: &mut [f32],
+    variance: &mut [f32],
+) {
     for at in (0..levels.len()).rev() {
         let (below, above) = levels.split_at_mut(at + 1);
         if let Some(Level { sums, change, variance }) = below.last_mut() {
-            settle(sums, above.first(), change, variance);
+            match above.first() {
+                Some(larger) => settle(sums, LOCAL, |cell, _| larger.around(cell, sums), change, variance),
+                None => settle(sums, TOP, |_, _| Known::default(), change, variance),
+            }
         }
     }
-    settle(cells, levels.first(), change, variance);
+    if let Some(larger) = levels.first() {
+        settle(cells, LOCAL, |cell, _| larger.around(cell, cells), change, variance);
+    }
+    if let Some(columns) = columns {
+        settle(columns, LOCAL, |_, window| window, change, variance);
+    }
 }
 
-/// The correction of each window by its own sums and that of the larger window around it.
-fn settle(sums: &Sums, larger: Option<&Level>, change: &mut [f32], variance: &mut [f32]) {
+/// A correction, and its variance.
+type Known = ([f32; 2], f32);
+
+/// The correction of each window by its own sums and by what is known beforehand, given the cell and what was here.
+fn settle(
+    sums: &Sums,
+    part: f32,
+    beforehand: impl Fn(usize, Known) -> Known,
+    change: &mut [f32],
+    variance: &mut [f32],
+) {
     let both = change.as_chunks_mut::<2>().0.iter_mut().zip(variance);
     for (cell, (change, variance)) in both.enumerate() {
-        let (before, unsure) =
-            larger.map_or(([0.0; 2], 0.0), |larger| larger.between(cell % sums.width, cell / sums.width));
+        let (before, unsure) = beforehand(cell, (*change, *variance));
         let sum = sums.at(cell);
         if sum[COUNT] <= 0.0 {
             (*change, *variance) = (before, UNKNOWN);
             continue;
         }
-        let part = if larger.is_some() { LOCAL } else { TOP };
         let (found, spread) = posterior(&sum, before, unsure, sum[BELIEF] / sum[COUNT] / (part * part));
         let length = (found[0] * found[0] + found[1] * found[1]).sqrt();
         // Asked this way round, a NaN changes nothing.
@@ -194,7 +238,7 @@ fn settle(sums: &Sums, larger: Option<&Level>, change: &mut [f32], variance: &mu
 
 /// Mean and half of the covariance's trace, where the window's correction is known beforehand to be `before` with the
 /// inverse variance `belief`, and `before` itself has the variance `unsure`.
-fn posterior(sum: &[f32; Sums::PLANES], before: [f32; 2], unsure: f32, belief: f32) -> ([f32; 2], f32) {
+fn posterior(sum: &[f32; Sums::PLANES], before: [f32; 2], unsure: f32, belief: f32) -> Known {
     // More difference than noise lets expect: moving things, light that changed, motion that is none. It weighs on all.
     let trust = 1.0 / (sum[MISFIT] / sum[COUNT]).max(1.0);
     let (middle, lean, skew) = (0.5 * (sum[XX] + sum[YY]), 0.5 * (sum[XX] - sum[YY]), sum[XY]);
@@ -218,8 +262,13 @@ fn posterior(sum: &[f32; Sums::PLANES], before: [f32; 2], unsure: f32, belief: f
 }
 
 impl Level {
+    /// Correction and variance around a cell of the next smaller level, whose sums these are.
+    fn around(&self, cell: usize, smaller: &Sums) -> Known {
+        self.between(cell % smaller.width, cell / smaller.width)
+    }
+
     /// Correction and variance at the place of a cell of the next smaller level, bilinear between the centres.
-    fn between(&self, column: usize, row: usize) -> ([f32; 2], f32) {
+    fn between(&self, column: usize, row: usize) -> Known {
         let near_and_far = |at: usize, count: usize| {
             let near = at / 2;
             [near, if at.is_multiple_of(2) { near.saturating_sub(1) } else { (near + 1).min(count - 1) }]
