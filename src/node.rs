@@ -5,10 +5,7 @@ mod governor;
 
 use std::{
     collections::BTreeMap,
-    sync::{
-        atomic::{AtomicBool, Ordering},
-        mpsc::{self, Receiver, SyncSender},
-    },
+    sync::atomic::{AtomicBool, Ordering},
     thread,
     time::{Duration, Instant},
 };
@@ -18,6 +15,7 @@ use crate::{
     clock::{self, Laps, Reservoir, Stage, Stopwatch},
     exposure::{Exposed, Linear, Noise},
     flow::{Flow, Lender, Own, State},
+    handover::{Giver, Taker, handover},
     motion::{Diagnosis, NoSight, Scale, Sector},
     pipeline::{Back, Outcome, Pipeline, Read},
     publish::{self, Moved, Offer, Sink, iceoryx2::SharedSink},
@@ -284,8 +282,8 @@ pub fn drive(
     let source = Reopening::new(open)?;
     let told = Told::default();
     let (front, back) = pipeline.map(Pipeline::halves).unzip();
-    let (to, passed) = mpsc::sync_channel(ahead::ROOM);
-    let (back_to, spares) = mpsc::sync_channel(ahead::SPARES);
+    let (to, passed) = handover(ahead::ROOM);
+    let (back_to, spares) = handover(ahead::SPARES);
     let ended = thread::scope(|scope| {
         let ahead = Ahead { source, front, stop, told: &told, to, spares };
         let named = thread::Builder::new().name("camera".into());
@@ -293,7 +291,7 @@ pub fn drive(
         let begin = clock::instant();
         let cadence = Cadence { last: begin, last_frame: begin, steps: 0, silence };
         Loop { back, outputs, governor, told: &told, spares: back_to, cadence, report: Report::default() }
-            .run(&passed, look)
+            .run(passed, look)
     });
     let finished = outputs.finish();
     if ended.is_err() {
@@ -310,15 +308,15 @@ struct Loop<'a, 'b> {
     outputs: &'a mut Outputs<'b>,
     governor: Option<Governor>,
     told: &'a Told,
-    spares: SyncSender<Linear>,
+    spares: Giver<Linear>,
     cadence: Cadence,
     report: Report,
 }
 
 impl Loop<'_, '_> {
     /// Takes what is passed until nothing more comes.
-    fn run(mut self, passed: &Receiver<Passed>, look: &mut dyn FnMut(&Report, Option<f64>)) -> Result<Report, Error> {
-        while let Ok(Passed { what, counts, progress }) = passed.recv() {
+    fn run(mut self, mut passed: Taker<Passed>, look: &mut dyn FnMut(&Report, Option<f64>)) -> Result<Report, Error> {
+        while let Some(Passed { what, counts, progress }) = passed.take() {
             self.report.source = counts;
             match what {
                 What::Sample(sample, read, took) => {
@@ -367,7 +365,7 @@ impl Loop<'_, '_> {
         report.watch.start(took);
         let mut spare = |linear| {
             // There is room for all that are out. If the other thread has ended, nobody wants it.
-            let _ = spares.try_send(linear);
+            let _ = spares.try_give(linear);
         };
         match back.step(sample, read, &mut spare, outputs.lender(), &mut report.watch) {
             Ok(Outcome::Moved(moved)) => {

@@ -9,7 +9,6 @@ use std::{
     sync::{
         Arc,
         atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering},
-        mpsc::{Receiver, SyncSender},
     },
     thread,
     time::{Duration, Instant},
@@ -20,6 +19,7 @@ use crate::{
     camera::{self, Counts, Next, Sample, Source},
     clock,
     exposure::Linear,
+    handover::{Giver, Taker},
     pipeline::{Front, Read},
     wire,
 };
@@ -82,8 +82,8 @@ pub(super) struct Ahead<'a> {
     pub front: Option<&'a mut Front>,
     pub stop: &'a AtomicBool,
     pub told: &'a Told,
-    pub to: SyncSender<Passed>,
-    pub spares: Receiver<Linear>,
+    pub to: Giver<Passed>,
+    pub spares: Taker<Linear>,
 }
 
 impl<'a> Reopening<'a> {
@@ -190,14 +190,14 @@ impl Ahead<'_> {
         if is_frame { self.taken() } else { true }
     }
 
-    fn pass(&self, what: What) -> bool {
+    fn pass(&mut self, what: What) -> bool {
         let passed = Passed { what, counts: self.source.counts(), progress: self.source.progress() };
-        self.to.send(passed).is_ok()
+        self.to.give(passed).is_ok()
     }
 
     /// Waits until the loop has taken the frame, and then until it will soon want the next one.
     fn taken(&mut self) -> bool {
-        let Ok(spare) = self.spares.recv() else { return false };
+        let Some(spare) = self.spares.take() else { return false };
         let begin = clock::instant();
         if let Some(front) = &mut self.front {
             front.reuse(spare);

@@ -4,7 +4,6 @@ use std::{
     sync::{
         Arc,
         atomic::{AtomicU64, Ordering},
-        mpsc::{Receiver, SyncSender, sync_channel},
     },
     thread::JoinHandle,
 };
@@ -14,7 +13,10 @@ use super::{
     outgoing::{self, Kept},
     pace::Pace,
 };
-use crate::wire::{DiagnosticArray, EgoMotion, Image, LaserScan, Status, Step, TwistWithCovarianceStamped};
+use crate::{
+    handover::{Giver, Taker, handover},
+    wire::{DiagnosticArray, EgoMotion, Image, LaserScan, Status, Step, TwistWithCovarianceStamped},
+};
 
 /// Steps that may wait for the network: a quarter of a second at 30 Hz, for results older than that help nobody.
 const STEPS_MAX: usize = 8;
@@ -74,9 +76,9 @@ pub struct Courier {
     name: &'static str,
     body_frame: String,
     images: Option<Pace>,
-    orders: Option<SyncSender<Order>>,
+    orders: Option<Giver<Order>>,
     /// Parcels come back here, so that a step allocates nothing.
-    spare: Receiver<Box<Parcel>>,
+    spare: Taker<Box<Parcel>>,
     lost: u64,
     unsent: Arc<AtomicU64>,
     thread: Option<JoinHandle<()>>,
@@ -103,17 +105,17 @@ struct Parcel {
 
 impl Courier {
     pub(super) fn open(name: &'static str, config: &Config, network: impl Network) -> Result<Self, Error> {
-        let (orders, ordered) = sync_channel(STEPS_MAX + STATUSES_MAX);
-        let (emptied, spare) = sync_channel(STEPS_MAX);
+        let (orders, ordered) = handover(STEPS_MAX + STATUSES_MAX);
+        let (mut emptied, spare) = handover(STEPS_MAX);
         for _ in 0..STEPS_MAX {
             // There is room for as many as there are.
-            let _ = emptied.try_send(Box::default());
+            let _ = emptied.try_give(Box::default());
         }
         let unsent = Arc::new(AtomicU64::new(0));
         let round = Round { network, name, unsent: unsent.clone(), told: false, image: Image::default() };
         let thread = std::thread::Builder::new()
             .name(format!("publish-{name}"))
-            .spawn(move || round.run(&ordered, &emptied))
+            .spawn(move || round.run(ordered, emptied))
             .map_err(|e| Error::Open { sink: name, reason: e.to_string() })?;
         Ok(Self {
             name,
@@ -127,8 +129,8 @@ impl Courier {
         })
     }
 
-    fn order(&self, order: Order) -> Result<(), ()> {
-        self.orders.as_ref().ok_or(())?.try_send(order).map_err(|_| ())
+    fn order(&mut self, order: Order) -> Result<(), ()> {
+        self.orders.as_mut().ok_or(())?.try_give(order).map_err(|_| ())
     }
 
     fn full(&self, what: String) -> Error {
@@ -147,7 +149,7 @@ impl Sink for Courier {
 
     fn offer(&mut self, offer: &Offer<'_>) -> Result<(), Error> {
         let moved = offer.moved;
-        let Ok(mut parcel) = self.spare.try_recv() else {
+        let Ok(mut parcel) = self.spare.try_take() else {
             self.lost += 1;
             return Err(self.full(format!("step {}", moved.step)));
         };
@@ -204,14 +206,14 @@ struct Round<N> {
 }
 
 impl<N: Network> Round<N> {
-    fn run(mut self, orders: &Receiver<Order>, emptied: &SyncSender<Box<Parcel>>) {
-        for order in orders {
+    fn run(mut self, mut orders: Taker<Order>, mut emptied: Giver<Box<Parcel>>) {
+        while let Some(order) = orders.take() {
             match order {
                 Order::Step(parcel) => {
                     let sent = self.step(&parcel);
                     self.unsent.fetch_add(u64::from(sent.is_err()), Ordering::Relaxed);
                     self.tell(sent);
-                    let _ = emptied.try_send(parcel);
+                    let _ = emptied.try_give(parcel);
                 }
                 Order::Status(status) => {
                     let sent = self.network.send(Message::Status(&status));
@@ -260,7 +262,7 @@ impl<N: Network> Round<N> {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::mpsc;
+    use std::sync::mpsc::{self, Receiver};
 
     use super::*;
     use crate::{

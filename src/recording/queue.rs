@@ -1,13 +1,15 @@
 //! What waits for the disk: bounded, in order, and waited for only by a source that waits itself.
 
 use std::{
-    collections::VecDeque,
-    sync::{Condvar, Mutex, MutexGuard, PoisonError},
+    sync::atomic::{AtomicBool, AtomicU32, AtomicUsize, Ordering},
     time::Duration,
 };
 
+use crossbeam_queue::ArrayQueue;
+
 use crate::{
     camera::Sample,
+    handover::Bell,
     publish::{
         Offer,
         outgoing::{self, Kept},
@@ -81,101 +83,101 @@ pub(super) struct Popped {
     pub(super) closed: bool,
 }
 
-#[derive(Default)]
-struct Waiting {
-    items: VecDeque<(Item, u32)>,
-    large: usize,
-    lost: [u32; 8],
-    // They travel in items as boxes; unboxing them here would only copy them.
-    #[allow(clippy::vec_box)]
-    spare: Vec<Box<StepItem>>,
-    closed: bool,
+/// What is of one size, large or small.
+struct Size {
+    waiting: AtomicUsize,
+    max: usize,
 }
 
 /// Large and small items are bounded apart, so that a fast gyro does not push frames out.
+///
+/// One thread pushes and one other pops. Neither holds a lock that the other could wait for.
 pub(super) struct Queue {
-    large_max: usize,
-    small_max: usize,
-    waiting: Mutex<Waiting>,
-    came: Condvar,
-    left: Condvar,
+    items: ArrayQueue<(Item, u32)>,
+    large: Size,
+    small: Size,
+    /// By kind, since the last item of it that found room; only the thread that pushes is concerned with them.
+    lost: [AtomicU32; 8],
+    spare: ArrayQueue<Box<StepItem>>,
+    closed: AtomicBool,
+    came: Bell,
+    left: Bell,
 }
 
 impl Queue {
     pub(super) fn new(large_max: usize, small_max: usize) -> Self {
-        Self { large_max, small_max, waiting: Mutex::default(), came: Condvar::new(), left: Condvar::new() }
+        let size = |max| Size { waiting: AtomicUsize::new(0), max };
+        Self {
+            items: ArrayQueue::new((large_max + small_max).max(1)),
+            large: size(large_max),
+            small: size(small_max),
+            lost: Default::default(),
+            // Beside those that wait, one is filled and one is written.
+            spare: ArrayQueue::new(large_max + 2),
+            closed: AtomicBool::new(false),
+            came: Bell::default(),
+            left: Bell::default(),
+        }
     }
 
     /// Adds an item, or answers how many of its size wait already; then it is lost.
     pub(super) fn push(&self, item: Item) -> Result<(), usize> {
-        let mut waiting = self.lock();
-        let (large, kind) = (item.large(), item.kind());
-        let (now, max) = self.room(&waiting, large);
-        if now >= max {
-            waiting.lost[kind] = waiting.lost[kind].saturating_add(1);
+        let (size, lost) = (self.size(&item), &self.lost[item.kind()]);
+        let missing = lost.load(Ordering::Relaxed);
+        // It is counted before it can be popped, so that the count never falls below none.
+        let waiting = size.waiting.fetch_add(1, Ordering::Acquire);
+        let refused = if waiting < size.max { self.items.push((item, missing)).err() } else { Some((item, missing)) };
+        if let Some((item, missing)) = refused {
+            size.waiting.fetch_sub(1, Ordering::Relaxed);
+            lost.store(missing.saturating_add(1), Ordering::Relaxed);
             if let Item::Step(step) = item {
-                waiting.spare.push(step);
+                self.give_back(step);
             }
-            return Err(now);
+            return Err(waiting);
         }
-        let lost = std::mem::take(&mut waiting.lost[kind]);
-        waiting.large += usize::from(large);
-        waiting.items.push_back((item, lost));
-        drop(waiting);
-        self.came.notify_one();
+        lost.store(0, Ordering::Relaxed);
+        self.came.ring();
         Ok(())
     }
 
-    /// How many of this size wait, and how many may.
-    fn room(&self, waiting: &Waiting, large: bool) -> (usize, usize) {
-        if large { (waiting.large, self.large_max) } else { (waiting.items.len() - waiting.large, self.small_max) }
+    fn size(&self, item: &Item) -> &Size {
+        if item.large() { &self.large } else { &self.small }
     }
 
     /// Waits for at most `wait` until there is room for the item; true when there is.
     pub(super) fn wait_for_room(&self, item: &Item, wait: Duration) -> bool {
-        let full = |waiting: &mut Waiting| {
-            let (now, max) = self.room(waiting, item.large());
-            now >= max
-        };
-        let waited = self.left.wait_timeout_while(self.lock(), wait, full).unwrap_or_else(PoisonError::into_inner);
-        !waited.1.timed_out()
+        let size = self.size(item);
+        self.left.wait(Some(wait), || size.waiting.load(Ordering::Acquire) < size.max)
     }
 
     /// The oldest item, waiting for at most `wait`.
     pub(super) fn pop(&self, wait: Duration) -> Popped {
-        let (mut waiting, _) = self
-            .came
-            .wait_timeout_while(self.lock(), wait, |waiting| waiting.items.is_empty() && !waiting.closed)
-            .unwrap_or_else(PoisonError::into_inner);
-        let item = waiting.items.pop_front();
-        if item.as_ref().is_some_and(|(item, _)| item.large()) {
-            waiting.large -= 1;
+        self.came.wait(Some(wait), || !self.items.is_empty() || self.closed.load(Ordering::Acquire));
+        // Asked before popping: what was pushed before the end is popped before it.
+        let closed = self.closed.load(Ordering::Acquire);
+        let item = self.items.pop();
+        if let Some((item, _)) = &item {
+            self.size(item).waiting.fetch_sub(1, Ordering::Release);
+            self.left.ring();
         }
-        let closed = waiting.closed;
-        drop(waiting);
-        self.left.notify_all();
         Popped { item, closed }
     }
 
     /// A step's box that was written and can be filled again.
     pub(super) fn spare(&self) -> Option<Box<StepItem>> {
-        self.lock().spare.pop()
+        self.spare.pop()
     }
 
     /// Gives a written step's box back.
     pub(super) fn give_back(&self, item: Box<StepItem>) {
-        self.lock().spare.push(item);
+        // There is room for all that there are.
+        let _ = self.spare.push(item);
     }
 
     /// Nothing will be added any more.
     pub(super) fn close(&self) {
-        self.lock().closed = true;
-        self.came.notify_all();
-    }
-
-    fn lock(&self) -> MutexGuard<'_, Waiting> {
-        // A panic elsewhere leaves the queue whole: every change to it is one statement.
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+        self.closed.store(true, Ordering::Release);
+        self.came.ring();
     }
 }
 

@@ -8,7 +8,7 @@ use std::{
 /// The stages in the order of the data; each may import only those before it.
 const STAGES: [&str; 6] = ["camera", "exposure", "flow", "motion", "publish", "recording"];
 /// What every stage may import.
-const GROUND: [&str; 2] = ["clock", "wire"];
+const GROUND: [&str; 3] = ["clock", "handover", "wire"];
 /// Files and folders that name no socket, thread or clock. The ONNX session is the flow's one exception.
 const PURE: [&str; 5] = ["exposure", "flow", "motion", "darkness", "pipeline.rs"];
 const IMPURE_IN_FLOW: &str = "flow/onnx";

@@ -5,7 +5,6 @@ use std::{
     sync::{
         Arc,
         atomic::{AtomicU64, Ordering},
-        mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel},
     },
     thread::JoinHandle,
     time::Duration,
@@ -17,6 +16,7 @@ use super::{
 };
 use crate::{
     flow::State,
+    handover::{Giver, Nothing, Taker, handover},
     motion::{Integrated, Scale, Velocity},
 };
 
@@ -53,7 +53,7 @@ pub(super) trait Voice: Send + 'static {
 pub struct Feed {
     name: &'static str,
     reach_cm: Option<u16>,
-    moments: Option<SyncSender<Moment>>,
+    moments: Option<Giver<Moment>>,
     lost: u64,
     unsaid: Arc<AtomicU64>,
     thread: Option<JoinHandle<()>>,
@@ -61,13 +61,13 @@ pub struct Feed {
 
 impl Feed {
     pub(super) fn open(name: &'static str, voice: impl Voice) -> Result<Self, Error> {
-        let (moments, heard) = sync_channel(MOMENTS_MAX);
+        let (moments, heard) = handover(MOMENTS_MAX);
         let reach_cm = voice.reach_cm();
         let unsaid = Arc::new(AtomicU64::new(0));
         let round = Round { voice, name, unsaid: unsaid.clone(), told: false };
         let thread = std::thread::Builder::new()
             .name(format!("publish-{name}"))
-            .spawn(move || round.run(&heard))
+            .spawn(move || round.run(heard))
             .map_err(|e| Error::Open { sink: name, reason: e.to_string() })?;
         Ok(Self { name, reach_cm, moments: Some(moments), lost: 0, unsaid, thread: Some(thread) })
     }
@@ -86,9 +86,9 @@ impl Sink for Feed {
         let velocity = moved.velocity.as_ref().ok().filter(trusted).copied();
         let ring = self.reach_cm.and_then(|max_cm| Ring::of(moved, max_cm));
         let moment = Moment { integrated: moved.integrated, velocity, ring };
-        let reason = match &self.moments {
-            Some(moments) if moments.try_send(moment).is_ok() => return Ok(()),
-            Some(_) => format!("the line is behind by {MOMENTS_MAX} steps"),
+        let reason = match self.moments.as_mut().map(|moments| moments.try_give(moment).is_ok()) {
+            Some(true) => return Ok(()),
+            Some(false) => format!("the line is behind by {MOMENTS_MAX} steps"),
             None => "the sink is finished".into(),
         };
         self.lost += 1;
@@ -129,16 +129,16 @@ struct Round<V> {
 }
 
 impl<V: Voice> Round<V> {
-    fn run(mut self, moments: &Receiver<Moment>) {
+    fn run(mut self, mut moments: Taker<Moment>) {
         loop {
-            let said = match moments.recv_timeout(TEND) {
+            let said = match moments.take_timeout(TEND) {
                 Ok(moment) => {
                     let said = self.voice.say(&moment);
                     self.unsaid.fetch_add(u64::from(said.is_err()), Ordering::Relaxed);
                     said
                 }
-                Err(RecvTimeoutError::Timeout) => Ok(()),
-                Err(RecvTimeoutError::Disconnected) => return,
+                Err(Nothing::Yet) => Ok(()),
+                Err(Nothing::AnyMore) => return,
             };
             let tended = self.voice.tend();
             self.tell(said.and(tended));
@@ -158,7 +158,7 @@ impl<V: Voice> Round<V> {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::mpsc;
+    use std::sync::mpsc::{self, Receiver};
 
     use super::*;
     use crate::{
