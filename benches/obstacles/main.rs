@@ -61,7 +61,8 @@ impl Asked {
             size: if bench { [640, 480] } else { [320, 256] },
             csv: None,
             plot: None,
-            flow: flow::Config::default(),
+            // As launch_configs/forward_avoidance.toml has it.
+            flow: flow::Config { refine_narrow: true, ..flow::Config::default() },
             variants: vec![],
         };
         let list = |value: &String| value.split(',').map(str::to_owned).collect::<Vec<String>>();
