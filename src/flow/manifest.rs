@@ -132,3 +132,25 @@ pub fn read(folder: &Path, file: &File) -> Result<Vec<u8>, Error> {
     }
     Ok(bytes)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An entry with these lines more.
+    fn entry(more: &str) -> Result<Entry, toml::de::Error> {
+        let files = ["pyramid", "decoder"].map(|part| format!("[{part}]\nfile = \"{part}.onnx\"\nsha256 = \"00\"\n"));
+        let head = "kind = \"pyramid_decoder\"\nopset = 17\nversion = \"1\"\n";
+        toml::from_str(&format!("{head}{more}\n{}", files.concat()))
+    }
+
+    #[test]
+    fn a_stride_is_five_halvings_where_it_says_so_and_six_where_it_says_nothing() {
+        assert_eq!(entry("").unwrap().stride, 64);
+        assert_eq!(entry("stride = 32").unwrap().stride, 32);
+        for wrong in [0, 2, 48, 128] {
+            let said = entry(&format!("stride = {wrong}")).unwrap_err().to_string();
+            assert!(said.contains(&format!("stride should be 4, 8, 16, 32 or 64, it is {wrong}")), "{said}");
+        }
+    }
+}
