@@ -5,7 +5,9 @@ import contextlib
 import functools
 import hashlib
 import io
+import json
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -450,14 +452,18 @@ def gigamacs(pyramid: Path, decoder: Path) -> float:
     return total / 1e9
 
 
-def manifest_entry(name: str, version: str, files: dict[str, Path], exported: Exported, stride: int = USUAL_STRIDE) -> str:
-    """The manifest's tables for one network, whose inputs are multiples of `stride`, with the golden output."""
+def manifest_entry(
+    name: str, version: str, files: dict[str, Path], exported: Exported, stride: int = USUAL_STRIDE, precisions: Sequence[str] = ()
+) -> str:
+    """The manifest's tables for one network, whose inputs are multiples of `stride`, and which may run in these `precisions` beside
+    fp32, with the golden output."""
     flow, uncertainty = exported(*golden_frames())
     rows, columns = np.ix_(GOLDEN_ROWS, GOLDEN_COLUMNS)
     lines = [f"[{name}]", 'kind = "pyramid_decoder"', f"opset = {OPSET}"]
     lines += [f"stride = {stride}"] if stride != USUAL_STRIDE else []
     lines += [f'version = "{version}"']
     lines += [f"gigamacs = {gigamacs(files['pyramid'], files['decoder']):.3f}"]
+    lines += [f"precisions = {json.dumps(list(precisions))}"] if precisions else []
     for part, file in files.items():
         lines += [f"[{name}.{part}]", f'file = "{file.name}"']
         lines += [f'sha256 = "{hashlib.sha256(file.read_bytes()).hexdigest()}"']
@@ -488,6 +494,7 @@ def main() -> None:
     parser.add_argument("--models", type=Path, default=Path("../models"))
     parser.add_argument("--iterations", type=int, nargs="+", help="for RAFT-small: a network for each, as 8 4 12")
     parser.add_argument("--plain", action="store_true", help="only the two graphs of ONNX's own operators")
+    parser.add_argument("--precisions", nargs="+", default=[], help="fewer bits that it was judged in by a ladder, as bf16")
     parser.add_argument("--fast", action="store_true", help="for PWC-Net: also NAME_fast, which ends at level 3")
     arguments = parser.parse_args()
     state = checkpoints.load(arguments.checkpoint)
@@ -528,7 +535,7 @@ def export(arguments: argparse.Namespace, network: nn.Module, state: dict, name:
         print(f"{height}x{width}: graphs and PyTorch differ by at most {worst:.1e} px")
         if worst > PARITY_PX:
             raise SystemExit(f"{height}x{width}: expected graphs within {PARITY_PX} px of PyTorch, got {worst}")
-    entry = manifest_entry(name, arguments.version, files, exported, stride)
+    entry = manifest_entry(name, arguments.version, files, exported, stride, arguments.precisions)
     write_manifest(arguments.models / "manifest.toml", name, entry)
 
 

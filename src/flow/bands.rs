@@ -33,7 +33,7 @@ impl<'a, T> Bands<'a, T> {
     }
 
     /// Cuts `memory` into bands of so many rows, and each of those into bands of so many columns, at most [`MOST`] in all. Those of
-    /// the first columns come first.
+    /// the first rows come first.
     pub fn tiled(memory: &'a mut [T], [planes, height, width]: [usize; 3], [rows, columns]: [usize; 2]) -> Self {
         let count = height.div_ceil(rows.max(1)) * width.div_ceil(columns.max(1));
         assert!(
@@ -45,11 +45,9 @@ impl<'a, T> Bands<'a, T> {
     }
 
     fn band(&self, number: usize) -> Option<Band<'_, T>> {
-        let down = self.height.div_ceil(self.rows.max(1)).max(1);
-        let (first, left) = (number % down * self.rows, (number / down).checked_mul(self.columns)?);
-        // Rows of no columns are handed out too.
-        let is_there = first < self.height && (left < self.width || number < down);
-        is_there.then(|| {
+        let across = self.width.div_ceil(self.columns.max(1)).max(1);
+        let (first, left) = ((number / across).checked_mul(self.rows)?, number % across * self.columns);
+        (first < self.height).then(|| {
             let (end, right) = ((first + self.rows).min(self.height), (left + self.columns).min(self.width));
             Band { bands: self, first, end, left, right }
         })
@@ -157,7 +155,7 @@ mod tests {
         for number in 0..4 {
             let mut band = bands.take(number).unwrap();
             let lengths = [band.end - band.first, band.right - band.left];
-            assert_eq!(lengths, [[2, 3], [1, 3], [2, 2], [1, 2]][number]);
+            assert_eq!(lengths, [[2, 3], [2, 2], [1, 3], [1, 2]][number]);
             for row in band.first..band.end {
                 assert_eq!(band.row(1, row).len(), lengths[1]);
                 band.row(1, row).fill(number + 1);
@@ -165,7 +163,7 @@ mod tests {
             assert!(bands.take(number).is_none());
         }
         assert!(bands.take(4).is_none());
-        assert_eq!(memory[15..], [1, 1, 1, 3, 3, 1, 1, 1, 3, 3, 2, 2, 2, 4, 4]);
+        assert_eq!(memory[15..], [1, 1, 1, 2, 2, 1, 1, 1, 2, 2, 3, 3, 3, 4, 4]);
         assert_eq!(memory[..15], [0; 15]);
     }
 

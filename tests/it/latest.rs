@@ -1,4 +1,4 @@
-//! The mailbox against a model that is simple enough to be seen right, and under two threads.
+//! The mailbox against a model that is simple enough to be seen right, and under several threads.
 
 use std::{sync::Arc, thread, time::Duration};
 
@@ -8,9 +8,15 @@ use nightflow::{
         latest::{Latest, Sender, mailbox},
     },
     clock::Stamp,
+    handover::handover,
     wire::{Header, Image, Imu, Range},
 };
 use proptest::prelude::*;
+
+use crate::allocations::{self, Allocations};
+
+/// Longer than anything here takes, and shorter than anybody waits.
+const LONG: Duration = Duration::from_secs(20);
 
 fn header(ns: i64) -> Header {
     Header { stamp: Stamp::from_ns(ns).into(), frame_id: String::new() }
@@ -156,7 +162,7 @@ fn a_slow_taker_sees_rising_frames_and_the_very_last_one() {
     let filling = thread::spawn(move || fill(&sender, FRAMES as i64));
     let (mut last, mut taken) = (-1, 0);
     loop {
-        match latest.next(Duration::from_secs(20)).unwrap() {
+        match latest.next(LONG).unwrap() {
             Next::Sample(sample @ Sample::Frame(_)) => {
                 let stamp = sample.stamp().ns();
                 assert!(stamp > last, "{stamp} came after {last}");
@@ -201,11 +207,11 @@ fn a_failure_is_told_once_after_what_waits() {
     sender.put(frame(1));
     sender.fail(Error::Lost { source_name: "ros2".into(), reason: "unplugged".into() });
     assert_eq!(take(&mut latest), Given::Frame(1));
-    let said = latest.next(Duration::from_secs(20)).unwrap_err().to_string();
+    let said = latest.next(LONG).unwrap_err().to_string();
     assert_eq!(said, "camera source ros2: unplugged");
     assert_eq!(latest.next(Duration::ZERO).unwrap(), Next::Idle);
     drop(sender);
-    assert_eq!(latest.next(Duration::from_secs(20)).unwrap(), Next::End);
+    assert_eq!(latest.next(LONG).unwrap(), Next::End);
 }
 
 #[test]
@@ -217,4 +223,85 @@ fn the_gyro_of_half_the_exposure_comes_before_its_frame() {
     assert_eq!(take(&mut latest), Given::Small(18));
     assert_eq!(take(&mut latest), Given::Small(25));
     assert_eq!(take(&mut latest), Given::Frame(20));
+}
+
+/// Takes until the end and shows everything; what was counted by then.
+fn take_all(latest: &mut Latest, mut see: impl FnMut(&Sample)) -> Counts {
+    loop {
+        match latest.next(LONG).unwrap() {
+            Next::Sample(sample) => see(&sample),
+            Next::Idle => panic!("nothing came in {LONG:?}"),
+            Next::End => return latest.counts(),
+        }
+    }
+}
+
+#[test]
+fn neither_the_mailbox_nor_a_row_allocates_for_what_goes_through() {
+    let (sender, mut latest) = mailbox(64);
+    let (mut giver, mut taker) = handover(2);
+    let samples: Vec<Sample> = (0..1000).flat_map(|k| [imu(3 * k), frame(3 * k + 1), frame(3 * k + 2)]).collect();
+    let mut through = |sample: &Sample| {
+        sender.put(sample.clone());
+        sender.numbered([1; 16], sample.stamp().ns());
+        while let Next::Sample(sample) = latest.next(Duration::ZERO).unwrap() {
+            giver.give(sample).unwrap();
+            drop(taker.take().unwrap());
+        }
+    };
+    // A thread's first look registers it.
+    samples[..30].iter().for_each(&mut through);
+    let ((), taken) = allocations::during(|| samples[30..].iter().for_each(&mut through));
+    assert_eq!(taken, Allocations::default());
+}
+
+#[test]
+fn frames_of_several_senders_are_taken_or_displaced_once_each_and_the_newest_is_taken() {
+    const SENDERS: i64 = 3;
+    const EACH: i64 = 20_000;
+    let (sender, mut latest) = mailbox(8);
+    let senders: Vec<_> = (0..SENDERS).map(|_| sender.clone()).collect();
+    drop(sender);
+    let (mut taken, mut newest) = (0, -1);
+    let counts = thread::scope(|scope| {
+        for (first, sender) in (0..).zip(senders) {
+            // Every second one is late, so that it has to give way.
+            let stamps = (0..EACH).map(move |k| (k ^ 1) * SENDERS + first);
+            scope.spawn(move || stamps.for_each(|stamp| sender.put(frame(stamp))));
+        }
+        take_all(&mut latest, |sample| {
+            taken += 1;
+            newest = newest.max(sample.stamp().ns());
+        })
+    });
+    assert_eq!(newest, SENDERS * EACH - 1);
+    let frames = (SENDERS * EACH) as u64;
+    assert_eq!((counts.arrived, counts.displaced), (frames, frames - taken));
+}
+
+#[test]
+fn a_small_sample_that_was_put_in_before_a_frame_is_taken_before_it() {
+    const FRAMES: i64 = 20_000;
+    let (sender, mut latest) = mailbox(64);
+    let (mut small, mut frames, mut last_frame, mut last_small) = (0, 0, -1, -1);
+    let counts = thread::scope(|scope| {
+        scope.spawn(move || {
+            for k in 0..FRAMES {
+                sender.put(imu(2 * k));
+                sender.put(frame(2 * k + 1));
+            }
+        });
+        take_all(&mut latest, |sample| {
+            let stamp = sample.stamp().ns();
+            assert!(stamp > last_frame.max(last_small), "{stamp} came after {last_frame} and {last_small}");
+            if matches!(sample, Sample::Frame(_)) {
+                assert_eq!(last_small, stamp - 1, "the newest small sample before a frame never makes room");
+                (last_frame, frames) = (stamp, frames + 1);
+            } else {
+                (last_small, small) = (stamp, small + 1);
+            }
+        })
+    });
+    assert_eq!(last_frame, 2 * FRAMES - 1);
+    assert_eq!((frames + counts.displaced, small + counts.overrun), (FRAMES as u64, FRAMES as u64));
 }

@@ -15,7 +15,6 @@ mod fcdn;
 mod flow;
 mod flow_files;
 mod fused;
-mod handover;
 mod iceoryx2;
 mod latest;
 mod launch_configs;
