@@ -39,12 +39,13 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// Speed and height are drawn evenly over their logarithms, 0.5–8 m/s and 2–30 m; every eighth flight hovers.
-    pub fn draw(number: u64, steps: usize, size: [usize; 2]) -> Plan {
+    /// Speed and height are drawn evenly over their logarithms, 0.5–8 m/s and 2–30 m; every flight of so
+    /// many as `hovers` says hovers.
+    pub fn draw(number: u64, steps: usize, size: [usize; 2], hovers: u64) -> Plan {
         let mut draws = Normals::new(number, 0x91a7);
         let mut between = |low: f64, high: f64| low * (high / low).powf(draws.uniform());
         let (speed, height) = (between(0.5, 8.0), between(2.0, 30.0));
-        Plan { number, speed: if number % 8 == 7 { 0.0 } else { speed }, height, steps, size }
+        Plan { number, speed: if number % hovers == hovers - 1 { 0.0 } else { speed }, height, steps, size }
     }
 
     /// Whether it hovers.

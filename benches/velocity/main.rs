@@ -35,6 +35,8 @@ use tables::Row;
 struct Asked {
     flights: u64,
     steps: usize,
+    /// One flight of so many hovers.
+    hovers: u64,
     size: [usize; 2],
     methods: Vec<String>,
     threads: usize,
@@ -53,6 +55,7 @@ impl Asked {
         let mut asked = Asked {
             flights: if bench { 40 } else { 1 },
             steps: if bench { 8 } else { 2 },
+            hovers: 8,
             size: if bench { [640, 480] } else { [320, 256] },
             methods: vec!["pwcnet_fcdn".into()],
             threads: 2,
@@ -68,6 +71,7 @@ impl Asked {
             match word.as_str() {
                 "--flights" => asked.flights = number()?,
                 "--steps" => asked.steps = number()? as usize,
+                "--hovers" => asked.hovers = number()?.max(1),
                 "--threads" => asked.threads = number()? as usize,
                 "--width" => asked.size = [number()? as usize, number()? as usize * 3 / 4],
                 "--methods" => asked.methods = value.split(',').map(str::to_owned).collect(),
@@ -77,7 +81,7 @@ impl Asked {
                 "--csv" => asked.csv = Some(value.into()),
                 _ => {
                     return Err(format!(
-                        "{word} is not known: --flights --steps --threads --width --methods --cache --csv --plot --motion"
+                        "{word} is not known: --flights --steps --hovers --threads --width --methods --cache --csv --plot --motion"
                     ));
                 }
             }
@@ -98,7 +102,7 @@ fn work(asked: &Asked, camera: &Noise, next: &AtomicU64) -> Result<Vec<Vec<Row>>
         if number >= asked.flights {
             return Ok(rows);
         }
-        let mut taken = Taken::new(Plan::draw(number, asked.steps, asked.size), asked.cache.as_deref())?;
+        let mut taken = Taken::new(Plan::draw(number, asked.steps, asked.size, asked.hovers), asked.cache.as_deref())?;
         for ((name, rows), matcher) in asked.methods.iter().zip(&mut rows).zip(&mut matchers) {
             let seen = taken.seen_by(name, matcher, camera)?;
             rows.extend(tables::judge(&taken.sensors, &seen, &asked.motion)?);

@@ -68,6 +68,8 @@ pub struct Config {
     pub flow_shared_sd_cells: f64,
     /// Flow error that all vectors of a step share, as a part of their length.
     pub flow_shared_sd_part: f64,
+    /// How far the ground may be from a plane: by what part of the distance it bends where a ray's slope is 1.
+    pub ground_bend_sd: f64,
     /// Clocks of gyro and camera that are further apart than this are said to be so.
     pub clock_offset_s_max: f64,
     /// A flow that turns further or less far than the gyro by more than this part is said to do so.
@@ -149,6 +151,7 @@ impl Default for Config {
             agree_rad_max: 0.015,
             flow_shared_sd_cells: 0.0005,
             flow_shared_sd_part: 0.001,
+            ground_bend_sd: 0.05,
             clock_offset_s_max: 0.002,
             turn_scale_off_max: 0.1,
             seed: 1,
@@ -197,6 +200,10 @@ pub const REASONS: &[(&str, &str)] = &[
          0.01 cells for vectors that [flow] refine = false leaves as the network gives them",
     ),
     ("flow_shared_sd_part", "the same bench, where the displacement is long; 0.005 without refining"),
+    (
+        "ground_bend_sd",
+        "a bulge of 5 cm a metre beside the image's middle: lawns and roads bend less, heaps and ditches more",
+    ),
     ("clock_offset_s_max", "at 1 rad/s² it turns 2 mrad/s that nobody made; twice what gyro_offset_sd_s counts with"),
     (
         "turn_scale_off_max",

@@ -42,7 +42,7 @@ pub(super) struct Turn {
     pub(super) first: Vector3<f64>,
     /// Rate at the newer stamp.
     pub(super) last: Vector3<f64>,
-    /// rad² of the integrated angle, an axis.
+    /// rad² of the integrated angle, an axis; the gyro's bias comes to that.
     pub(super) variance: f64,
     /// (rad/s)² of `last` − `first`, an axis; none where no gyro was there.
     pub(super) swing_variance: Option<f64>,
@@ -162,7 +162,7 @@ impl Rates {
             return Err(gap());
         }
         let held = 0.5 * config.spin_sd_rad_s2 * (held_first.powi(2) + held_last.powi(2));
-        let variance = noise + (config.gyro_bias_sd_rad_s * interval_s).powi(2) + held * held;
+        let variance = noise + held * held;
         // Interpolating between two samples takes a third off the variance, on the average.
         let swing_variance = Some(4.0 / 3.0 * variance_last);
         Ok(Turn { rotation, mean: angle / interval_s, first, last, variance, swing_variance })

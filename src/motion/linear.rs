@@ -1,19 +1,118 @@
 //! How the fit's result changes with whatever is uncertain, to first order: residuals and how alike they are, the turn, a
 //! shift of all vectors, the normal.
 
-use nalgebra::{Matrix3, Matrix5, Matrix5x2, Matrix5x3, SMatrix, SVector, Vector2, Vector3};
+use nalgebra::{Matrix3, Matrix3x2, Matrix5, Matrix5x2, Matrix5x3, SMatrix, SVector, Vector2, Vector3};
 
-use super::fit::{Fit, Found, Motion};
+use super::fit::{Fit, Found, Motion, Sight};
 
 /// The turn that is left in the vectors: by how much what the gyro said is more than what they show.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Leftover {
     /// Radians, optical axes.
     pub(super) angle: Vector3<f64>,
-    /// Inverse covariance, by the residuals.
+    /// Inverse covariance, by the spread of the residuals.
     pub(super) information: Matrix3<f64>,
     /// The same two where the camera is taken not to have moved.
     pub(super) still: (Vector3<f64>, Matrix3<f64>),
+    /// Covariance of `angle`, by the residuals themselves.
+    pub(super) covariance: Matrix3<f64>,
+    /// Covariance of the motion (τ, lean) with it.
+    pub(super) with_motion: Matrix5x3<f64>,
+    /// Its change with a shift that all vectors share.
+    pub(super) by_shift: Matrix3x2<f64>,
+    /// Its change with an error of the normal that was given.
+    pub(super) by_normal: Matrix3<f64>,
+}
+
+/// Sums over the vectors that agree: slopes are second derivatives of the cost, noises the squares of its first.
+struct Sums<const D: usize> {
+    slope: SMatrix<f64, D, D>,
+    slope_turn: Matrix3<f64>,
+    noise: SMatrix<f64, D, D>,
+    noise_turn: Matrix3<f64>,
+    /// Of motion and turn.
+    noise_both: SMatrix<f64, D, 3>,
+    /// What each of these pulls the motion by, …
+    by_turn: SMatrix<f64, D, 3>,
+    by_normal: SMatrix<f64, D, 3>,
+    by_shift: SMatrix<f64, D, 2>,
+    /// … and the turn.
+    turn_pull: Vector3<f64>,
+    turn_by_normal: Matrix3<f64>,
+    turn_by_shift: Matrix3x2<f64>,
+    /// Sum of the squared lengths as they were seen.
+    stretch: f64,
+    count: f64,
+}
+
+impl<const D: usize> Sums<D> {
+    fn over<'a>(sights: impl Iterator<Item = &'a Sight>, motion: &Motion, spread: f64) -> Self {
+        let mut sums = Self {
+            slope: SMatrix::zeros(),
+            slope_turn: Matrix3::zeros(),
+            noise: SMatrix::zeros(),
+            noise_turn: Matrix3::zeros(),
+            noise_both: SMatrix::zeros(),
+            by_turn: SMatrix::zeros(),
+            by_normal: SMatrix::zeros(),
+            by_shift: SMatrix::zeros(),
+            turn_pull: Vector3::zeros(),
+            turn_by_normal: Matrix3::zeros(),
+            turn_by_shift: Matrix3x2::zeros(),
+            stretch: 0.0,
+            count: 0.0,
+        };
+        for sight in sights {
+            let (rows, turned) = (sight.rows::<D>(motion), sight.turned());
+            let by = sight.tukey_slope(spread);
+            let (bent, bent_turn) = (rows.transpose() * by, turned.transpose() * by);
+            let weighted = Vector2::from(sight.residual) * (sight.weight * sight.tukey(spread));
+            let pull: SVector<f64, D> = rows.transpose() * weighted;
+            let pull_turn = turned.transpose() * weighted;
+            let slanted = sight.per_slope(&motion.tau) * Vector3::new(sight.older[0], sight.older[1], 1.0).transpose();
+            sums.slope += bent * rows;
+            sums.slope_turn += bent_turn * turned;
+            sums.noise += pull * pull.transpose();
+            sums.noise_turn += pull_turn * pull_turn.transpose();
+            sums.noise_both += pull * pull_turn.transpose();
+            sums.by_turn += bent * turned;
+            sums.by_normal += bent * slanted;
+            sums.by_shift += bent;
+            sums.turn_pull += pull_turn;
+            sums.turn_by_normal += bent_turn * slanted;
+            sums.turn_by_shift += bent_turn;
+            sums.stretch += sight.stretch * sight.stretch;
+            sums.count += 1.0;
+        }
+        sums
+    }
+
+    /// The turn that is left, where the motion is fitted beside it; `inverse` is that of `slope`.
+    fn leftover(
+        &self,
+        inverse: &SMatrix<f64, D, D>,
+        tau: &Vector3<f64>,
+        likeness: f64,
+        spread: f64,
+    ) -> Option<Leftover> {
+        let by_turn = inverse * self.by_turn;
+        let apart = self.slope_turn - self.by_turn.transpose() * by_turn;
+        let (moving, still) = invert(&apart).zip(invert(&self.slope_turn))?;
+        let moved = self.by_turn.fixed_view::<3, 3>(0, 0).transpose() * tau;
+        let variance = likeness * spread * spread;
+        let both = self.noise_both - self.noise * by_turn;
+        let noise = self.noise_turn - self.noise_both.transpose() * by_turn - by_turn.transpose() * both;
+        let with_motion = inverse * both * moving;
+        Some(Leftover {
+            angle: moving * self.turn_pull,
+            information: apart / variance,
+            still: (still * (self.turn_pull + moved), self.slope_turn / variance),
+            covariance: moving * noise * moving.transpose(),
+            with_motion: Matrix5x3::from_fn(|i, j| if i < D { with_motion[(i, j)] } else { 0.0 }),
+            by_shift: moving * (self.turn_by_shift - by_turn.transpose() * self.by_shift),
+            by_normal: moving * (self.turn_by_normal - by_turn.transpose() * self.by_normal),
+        })
+    }
 }
 
 impl Fit {
@@ -26,48 +125,24 @@ impl Fit {
         spread: f64,
         lean_sd: Option<f64>,
     ) -> Option<Found> {
-        let (mut slope, mut noise) = (SMatrix::<f64, D, D>::zeros(), SMatrix::<f64, D, D>::zeros());
-        let (mut by_turn, mut by_normal) = (SMatrix::<f64, D, 3>::zeros(), SMatrix::<f64, D, 3>::zeros());
-        let mut by_shift = SMatrix::<f64, D, 2>::zeros();
-        let (mut turn_slope, mut turn_pull) = (Matrix3::zeros(), Vector3::zeros());
-        let (mut stretch, mut count) = (0.0, 0.0);
-        for sight in self.sights.iter().filter(|sight| sight.offered && sight.agrees) {
-            let (rows, turned) = (sight.rows::<D>(motion), sight.turned());
-            let by = sight.tukey_slope(spread);
-            let bent = rows.transpose() * by;
-            slope += bent * rows;
-            let weighted = Vector2::from(sight.residual) * (sight.weight * sight.tukey(spread));
-            let pull: SVector<f64, D> = rows.transpose() * weighted;
-            noise += pull * pull.transpose();
-            by_turn += bent * turned;
-            by_shift += bent;
-            by_normal +=
-                bent * sight.per_slope(&motion.tau) * Vector3::new(sight.older[0], sight.older[1], 1.0).transpose();
-            turn_slope += turned.transpose() * by * turned;
-            turn_pull += turned.transpose() * weighted;
-            stretch += sight.stretch * sight.stretch;
-            count += 1.0;
-        }
-        let likeness = unfitted(self.likeness(), count, D);
-        noise *= likeness;
+        let agreed = self.sights.iter().filter(|sight| sight.offered && sight.agrees);
+        let mut sums = Sums::<D>::over(agreed, motion, spread);
+        let likeness = unfitted(self.likeness(), sums.count, D);
+        sums.noise *= likeness;
+        sums.noise_turn *= likeness;
+        sums.noise_both *= likeness;
         if let Some(sd) = lean_sd {
             let prior = likeness * (spread / sd).powi(2);
             for axis in 3..D {
-                slope[(axis, axis)] += prior;
-                noise[(axis, axis)] += (prior * sd).powi(2);
+                sums.slope[(axis, axis)] += prior;
+                sums.noise[(axis, axis)] += (prior * sd).powi(2);
             }
         }
-        let inverse = invert(&slope)?;
-        let apart = turn_slope - by_turn.transpose() * inverse * by_turn;
-        let moved = by_turn.fixed_view::<3, 3>(0, 0).transpose() * motion.tau;
-        let variance = likeness * spread * spread;
-        let leftover = invert(&apart).zip(invert(&turn_slope)).map(|(moving, still)| Leftover {
-            angle: moving * turn_pull,
-            information: apart / variance,
-            still: (still * (turn_pull + moved), turn_slope / variance),
-        });
-        let found = inverse * noise * inverse.transpose();
-        let (by_turn, by_shift, by_normal) = (inverse * by_turn, inverse * by_shift, inverse * by_normal);
+        let inverse = invert(&sums.slope)?;
+        let leftover = sums.leftover(&inverse, &motion.tau, likeness, spread);
+        let found = inverse * sums.noise * inverse.transpose();
+        let (by_turn, by_shift, by_normal) =
+            (inverse * sums.by_turn, inverse * sums.by_shift, inverse * sums.by_normal);
         let given = lean_sd.is_none();
         Some(Found {
             tau: motion.tau,
@@ -79,7 +154,7 @@ impl Fit {
             leftover,
             samples: 0,
             inliers: 0,
-            stretch: (stretch / f64::max(count, 1.0)).sqrt(),
+            stretch: (sums.stretch / f64::max(sums.count, 1.0)).sqrt(),
         })
     }
 

@@ -4,11 +4,14 @@
 //! integrated over exactly the interval, turns m₂ back into the older frame's axes: p₂. With n the unit vector to the
 //! ground, d the distance along it and t the camera's displacement, τ = t/d obeys
 //! x₂ − x₁ = (n·m₁)(−τ_x + x₂ τ_z) and the same in y: exact, and linear in τ. A seeded RANSAC starts the fit, and
-//! iteratively re-weighted least squares ends it. Where n is not known either it is fitted with τ.
+//! iteratively re-weighted least squares ends it. Where n is not known either it is fitted with τ. What the vectors then
+//! show of the gyro's error is taken off, and its bias is learnt (`fusion`).
 
+mod bias;
 mod config;
 mod drift;
 mod fit;
+mod fusion;
 mod ground;
 mod gyro;
 mod integrated;
@@ -42,7 +45,7 @@ pub struct Velocity {
     pub newer: Stamp,
     /// m/s when metric, 1/s when per distance.
     pub linear: [f64; 3],
-    /// rad/s, mean over the interval, body frame.
+    /// rad/s, mean over the interval, body frame: the gyro's, less the bias that the flow has shown so far.
     pub angular: [f64; 3],
     /// Row-major over (linear, angular): flow noise by the residuals and the number of effectively independent vectors,
     /// gyro, range, tilt and stamps by the settings or their messages. An axis that was not observed has a large

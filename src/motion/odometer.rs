@@ -1,9 +1,10 @@
 //! The odometer: keeps gyro, range and calibration, and turns each step's flow into the body's velocity.
 
-use nalgebra::{Matrix3, Matrix3x5, Matrix6, Quaternion, Rotation3, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion, Vector3};
 
 use super::{
-    AttitudeUse, Config, Diagnosis, Drift, Error, GyroUse, Lack, Mount, NoDistance, Scale, Velocity,
+    AttitudeUse, Config, Diagnosis, Drift, Error, GyroUse, Lack, Mount, NoDistance, Velocity,
+    bias::Bias,
     drift::{Turned, Watch},
     fit::{Fit, Found, Sight},
     ground::Ranges,
@@ -12,16 +13,12 @@ use super::{
     mounting::Mounting,
     obstacles::Sighting,
     plane::Plane,
-    quality,
 };
 use crate::{
     clock::Stamp,
     flow::{Flow, Grid},
     wire::{CameraInfo, Imu, Range, TfMessage},
 };
-
-/// (rad/s)² of a body rate that nothing observed.
-const UNOBSERVED: f64 = 1e6;
 
 /// The body as good as stands still where it turns across the optical axis by more than this, radians, …
 const STILL_TURN_MIN: f64 = 3e-3;
@@ -47,6 +44,7 @@ pub struct Odometer {
     fit: Fit,
     pub(super) plane: Plane,
     watch: Watch,
+    pub(super) bias: Bias,
     /// From a frame's stamp to the middle of its exposure.
     half_exposure_ns: i64,
 }
@@ -56,10 +54,10 @@ pub(super) struct Ground {
     /// Unit vector to the ground, body axes.
     pub(super) normal: Vector3<f64>,
     /// The two directions that it may be off in.
-    tangents: [Vector3<f64>; 2],
+    pub(super) tangents: [Vector3<f64>; 2],
     /// How far it may be off where it is given, and where it is fitted.
-    tilt_sd: f64,
-    lean_sd: Option<f64>,
+    pub(super) tilt_sd: f64,
+    pub(super) lean_sd: Option<f64>,
     pub(super) distance: Result<Distance, NoDistance>,
 }
 
@@ -73,9 +71,9 @@ pub(super) struct Span {
 
 pub(super) struct Distance {
     pub(super) metres: f64,
-    sd: f64,
+    pub(super) sd: f64,
     /// The point that the beam hit, from the camera, body axes: how a tilt's error changes the distance.
-    hit: Vector3<f64>,
+    pub(super) hit: Vector3<f64>,
 }
 
 impl Odometer {
@@ -115,6 +113,7 @@ impl Odometer {
             fit: Fit::default(),
             plane: Plane::default(),
             watch: Watch::default(),
+            bias: Bias::default(),
             half_exposure_ns: 0,
         })
     }
@@ -176,7 +175,12 @@ impl Odometer {
 
     /// Takes a gyro sample; refuses one that is not finite or whose clock went back.
     pub fn imu(&mut self, imu: &Imu) -> Result<(), Error> {
-        self.rates.keep(imu, &self.config)
+        let kept = self.rates.keep(imu, &self.config);
+        if matches!(kept, Err(Error::Backwards { anew: true, .. })) {
+            // It may be another gyro, or this one on another day.
+            self.bias = Bias::default();
+        }
+        kept
     }
 
     /// Takes a range; refuses one that is not a number or whose clock went back.
@@ -297,7 +301,8 @@ impl Odometer {
     /// Keeps what the flow shows of the turn beside what the gyro says.
     ///
     /// A turn about the optical axis looks like no motion over the ground. A turn across it differs from a shift by its
-    /// curvature alone, which networks smooth away; it is compared only where the body as good as stands still.
+    /// curvature alone, and so does a motion over ground that bends; it is compared only where the body as good as stands
+    /// still.
     fn compare(&mut self, turn: &Turn, found: &Found, span: Span) {
         let (Some(leftover), Some(swing_variance)) = (found.leftover, turn.swing_variance) else { return };
         let mount = self.mount.matrix();
@@ -370,103 +375,6 @@ impl Odometer {
         let cells = rows().flat_map(|row| columns().map(move |column| (column, row)));
         let sights = cells.zip(&self.rays).map(|((column, row), ray)| sight(column, row, *ray).unwrap_or_default());
         self.fit.sights.extend(sights);
-    }
-
-    /// From the fit's camera axes to the newer body axes, with everything that makes the velocity uncertain.
-    fn conclude(&self, turn: &Turn, ground: &Ground, found: &Found, span: Span, shared: f64) -> Velocity {
-        let config = &self.config;
-        let forward = turn.rotation.inverse();
-        let to_newer = forward.to_rotation_matrix() * self.mount;
-        let distance = ground.distance.as_ref();
-        let interval_s = span.seconds;
-        // A normal that leans is longer than a unit: what is too long there is too short in τ.
-        let unit = (1.0 + found.lean[0].powi(2) + found.lean[1].powi(2)).sqrt();
-        let scale = distance.map_or(1.0, |d| d.metres) / interval_s * unit;
-        // The camera's lever arm turns with the body; without a distance there are no metres to take it off in.
-        let arm = if distance.is_ok() { Vector3::from(config.camera_offset_m) } else { Vector3::zeros() };
-        let lever = (arm - forward * arm) / interval_s;
-        let camera = to_newer * found.tau * scale;
-        let linear = camera - lever;
-        let mut spread = Spread::default();
-        let to_body = to_newer.matrix() * scale;
-        // What is wrong about the normal is wrong about the distance too.
-        let longer = |tilt: &Vector3<f64>| distance.map_or(0.0, |d| tilt.dot(&d.hit) / d.metres);
-        let leans = ground
-            .tangents
-            .map(|tangent| if ground.lean_sd.is_some() { camera * longer(&tangent) } else { Vector3::zeros() });
-        let both = Matrix3x5::from_fn(|i, j| if j < 3 { to_body[(i, j)] } else { leans[j - 3][i] });
-        spread.linear(&(both * found.covariance * both.transpose()));
-        for column in found.by_shift.column_iter() {
-            spread.error(both * column * shared, Vector3::zeros());
-        }
-        // An error of the turn, in the older body's axes, as it reaches the velocity and the mean rate.
-        let by_turn = both * found.by_turn * self.mount.inverse().matrix();
-        let turned = |error: Vector3<f64>| (by_turn * error - (error / interval_s).cross(&arm), error / interval_s);
-        for axis in 0..3 {
-            let (v, w) = turned(Vector3::ith(axis, turn.variance.sqrt()));
-            spread.error(v, w);
-        }
-        let (v, w) = turned((turn.last - turn.first) * config.gyro_offset_sd_s);
-        spread.error(v, w);
-        for (rate, sign) in [(turn.first, -1.0), (turn.last, 1.0)] {
-            let jitter = config.stamp_jitter_sd_s * sign;
-            let (v, w) = turned(rate * jitter);
-            spread.error(v - linear * (jitter / interval_s), w - turn.mean * (jitter / interval_s));
-        }
-        for tangent in ground.tangents {
-            let tilt = tangent * ground.tilt_sd;
-            let moved = to_body * found.by_normal * (self.mount.inverse() * tilt);
-            spread.error(moved - camera * longer(&tilt), Vector3::zeros());
-        }
-        if let Ok(d) = distance {
-            spread.error(camera * (d.sd / d.metres), Vector3::zeros());
-        }
-        if turn.swing_variance.is_none() {
-            spread.unobserved();
-        }
-        let scale = match &ground.distance {
-            Ok(d) => Scale::Metric { distance: d.metres },
-            Err(why) => Scale::PerDistance(*why),
-        };
-        Velocity {
-            older: span.older,
-            newer: span.newer,
-            linear: linear.into(),
-            angular: turn.mean.into(),
-            covariance: spread.rows(),
-            scale,
-            samples: found.samples,
-            inliers: found.inliers,
-            quality: quality::of(&linear, &spread.0.fixed_view::<3, 3>(0, 0).into(), &scale),
-        }
-    }
-}
-
-/// The covariance of (linear, angular) as a sum of independent errors.
-#[derive(Default)]
-struct Spread(Matrix6<f64>);
-
-impl Spread {
-    fn linear(&mut self, covariance: &Matrix3<f64>) {
-        let mut block = self.0.fixed_view_mut::<3, 3>(0, 0);
-        block += covariance;
-    }
-
-    fn error(&mut self, linear: Vector3<f64>, angular: Vector3<f64>) {
-        let both = Vector6::new(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z);
-        self.0 += both * both.transpose();
-    }
-
-    /// Nothing is known of the rates: they are not correlated with anything, and anything they may be.
-    fn unobserved(&mut self) {
-        self.0.fixed_view_mut::<3, 3>(0, 3).fill(0.0);
-        self.0.fixed_view_mut::<3, 3>(3, 0).fill(0.0);
-        self.0.fixed_view_mut::<3, 3>(3, 3).copy_from(&(Matrix3::identity() * UNOBSERVED));
-    }
-
-    /// Symmetric to the bit.
-    fn rows(&self) -> [[f64; 6]; 6] {
-        std::array::from_fn(|i| std::array::from_fn(|j| self.0[(i.min(j), i.max(j))]))
     }
 }
 

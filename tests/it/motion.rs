@@ -1,5 +1,6 @@
 //! Velocity from flow over a plane: exact where the flow is, honest where it is not, and silent where it must be.
 
+mod bias;
 mod lens;
 mod watch;
 

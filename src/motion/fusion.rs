@@ -1,0 +1,229 @@
+//! From the fit to the velocity: everything that errs is one column of unit variance, the flow says what it can about
+//! each, and what is left is the covariance.
+//!
+//! The turn that the gyro says is taken off before the fit. Its error, e, leaves (−xy, 1 + x²; −(1 + y²), xy) e in the
+//! vectors: mostly a shift, which the fit takes for motion over the ground, but bent by x² and y², which no motion over
+//! a plane is. Where the bend is known better than the gyro is, that is in a hover, it tells shift from motion: the
+//! vectors' own word on e, `Leftover::angle`, updates what the sensors are believed to err by (a Kalman update over all
+//! of their errors together, for a tilted plane bends vectors too). What it says of the gyro's bias is kept for the
+//! steps to come.
+
+use nalgebra::{Matrix3, Matrix3x5, Matrix6, Matrix6x3, SMatrix, SVector, Vector3};
+
+use super::{
+    Odometer, Scale, Velocity,
+    bias::Shown,
+    fit::Found,
+    gyro::Turn,
+    odometer::{Ground, Span},
+    quality,
+};
+
+/// (rad/s)² of a body rate that nothing observed.
+const UNOBSERVED: f64 = 1e6;
+/// Turn (3), its clock, two stamps, two tilts, two shifts, the distance; …
+const PASSING: usize = 11;
+/// … and the gyro's bias.
+const ERRORS: usize = PASSING + 3;
+/// The turn that is left in the vectors is no error of the sensors where its square over its covariance is larger: one
+/// step of a thousand, by chance.
+const GATE: f64 = 16.3;
+
+/// What errs, a column each: by one deviation of it, …
+#[derive(Default)]
+struct Errors {
+    /// … the estimate less the truth in (linear, angular), …
+    moved: SMatrix<f64, 6, ERRORS>,
+    /// … and the turn that is left in the vectors, radians, optical axes.
+    seen: SMatrix<f64, 3, ERRORS>,
+    count: usize,
+    /// What the bias that is believed in has done to both.
+    mean: (SVector<f64, 6>, Vector3<f64>),
+}
+
+impl Errors {
+    fn add(&mut self, linear: Vector3<f64>, angular: Vector3<f64>, seen: Vector3<f64>) {
+        self.moved.fixed_view_mut::<3, 1>(0, self.count).copy_from(&linear);
+        self.moved.fixed_view_mut::<3, 1>(3, self.count).copy_from(&angular);
+        self.seen.set_column(self.count, &seen);
+        self.count += 1;
+    }
+}
+
+impl Odometer {
+    /// From the fit's camera axes to the newer body axes, with everything that makes the velocity uncertain. `shared` is
+    /// what all vectors may err by together, radians.
+    pub(super) fn conclude(
+        &mut self,
+        turn: &Turn,
+        ground: &Ground,
+        found: &Found,
+        span: Span,
+        shared: f64,
+    ) -> Velocity {
+        let forward = turn.rotation.inverse();
+        let to_newer = forward.to_rotation_matrix() * self.mount;
+        let distance = ground.distance.as_ref();
+        // A normal that leans is longer than a unit: what is too long there is too short in τ.
+        let unit = (1.0 + found.lean[0].powi(2) + found.lean[1].powi(2)).sqrt();
+        let scale = distance.map_or(1.0, |d| d.metres) / span.seconds * unit;
+        // The camera's lever arm turns with the body; without a distance there are no metres to take it off in.
+        let arm = if distance.is_ok() { Vector3::from(self.config.camera_offset_m) } else { Vector3::zeros() };
+        let lever = (arm - forward * arm) / span.seconds;
+        let camera = to_newer * found.tau * scale;
+        let to_body = to_newer.matrix() * scale;
+        let leans = ground.tangents.map(|tangent| match ground.lean_sd {
+            Some(_) => camera * ground.longer(&tangent),
+            None => Vector3::zeros(),
+        });
+        let fitted = Fitted {
+            by_motion: Matrix3x5::from_fn(|i, j| if j < 3 { to_body[(i, j)] } else { leans[j - 3][i] }),
+            camera,
+            linear: camera - lever,
+            arm,
+        };
+        let errors = self.errors(turn, ground, found, span, &fitted, shared);
+        let (shift, mut covariance) = self.learn(&errors, found, span, &fitted, shared);
+        let linear = fitted.linear - shift;
+        let angular = turn.mean - errors.mean.0.fixed_rows::<3>(3);
+        if turn.swing_variance.is_none() {
+            unobserved(&mut covariance);
+        }
+        let scale = match &ground.distance {
+            Ok(d) => Scale::Metric { distance: d.metres },
+            Err(why) => Scale::PerDistance(*why),
+        };
+        Velocity {
+            older: span.older,
+            newer: span.newer,
+            linear: linear.into(),
+            angular: angular.into(),
+            // Symmetric to the bit.
+            covariance: std::array::from_fn(|i| std::array::from_fn(|j| covariance[(i.min(j), i.max(j))])),
+            scale,
+            samples: found.samples,
+            inliers: found.inliers,
+            quality: quality::of(&linear, &covariance.fixed_view::<3, 3>(0, 0).into(), &scale),
+        }
+    }
+
+    /// Everything that errs and is not the vectors' own noise.
+    fn errors(&self, turn: &Turn, ground: &Ground, found: &Found, span: Span, fit: &Fitted, shared: f64) -> Errors {
+        let (config, interval_s) = (&self.config, span.seconds);
+        let to_camera = self.mount.inverse();
+        let mut errors = Errors::default();
+        // An error of the turn, in the older body's axes, as it reaches the velocity and the mean rate.
+        let by_turn = fit.by_motion * found.by_turn * to_camera.matrix();
+        let turned = |error: Vector3<f64>| (by_turn * error - (error / interval_s).cross(&fit.arm), error / interval_s);
+        for axis in 0..3 {
+            let error = Vector3::ith(axis, turn.variance.sqrt());
+            let (v, w) = turned(error);
+            errors.add(v, w, to_camera * error);
+        }
+        let error = (turn.last - turn.first) * config.gyro_offset_sd_s;
+        let (v, w) = turned(error);
+        errors.add(v, w, to_camera * error);
+        for (rate, sign) in [(turn.first, -1.0), (turn.last, 1.0)] {
+            let jitter = config.stamp_jitter_sd_s * sign;
+            let (v, w) = turned(rate * jitter);
+            let longer = jitter / interval_s;
+            errors.add(v - fit.linear * longer, w - turn.mean * longer, to_camera * (rate * jitter));
+        }
+        let (by_normal, by_shift) =
+            found.leftover.as_ref().map_or_else(Default::default, |left| (left.by_normal, left.by_shift));
+        let still = Vector3::zeros();
+        for tangent in ground.tangents {
+            let tilt = tangent * ground.tilt_sd;
+            let moved = fit.by_motion.fixed_columns::<3>(0) * (found.by_normal * (to_camera * tilt));
+            errors.add(moved - fit.camera * ground.longer(&tilt), still, by_normal * (to_camera * tilt));
+        }
+        for axis in 0..2 {
+            let moved = fit.by_motion * found.by_shift.column(axis) * shared;
+            errors.add(moved, still, by_shift.column(axis) * shared);
+        }
+        let part = ground.distance.as_ref().map_or(0.0, |d| d.sd / d.metres);
+        errors.add(fit.camera * part, still, still);
+        if turn.swing_variance.is_some() {
+            let believed = self.bias.believed(config.gyro_bias_sd_rad_s);
+            for column in believed.root.column_iter() {
+                let error = column * interval_s;
+                let (v, w) = turned(error);
+                errors.add(v, w, to_camera * error);
+            }
+            let (v, w) = turned(believed.mean * interval_s);
+            errors.mean.0.fixed_rows_mut::<3>(0).copy_from(&v);
+            errors.mean.0.fixed_rows_mut::<3>(3).copy_from(&w);
+            errors.mean.1 = to_camera * (believed.mean * interval_s);
+        }
+        errors
+    }
+
+    /// What the turn that is left in the vectors says about all errors: what the linear velocity is to be less by, and
+    /// the covariance that is left. What it says about the bias is kept. Without a gyro it is left alone: a turn that
+    /// nobody measured is too large for the linear terms.
+    fn learn(
+        &mut self,
+        errors: &Errors,
+        found: &Found,
+        span: Span,
+        fit: &Fitted,
+        shared: f64,
+    ) -> (Vector3<f64>, Matrix6<f64>) {
+        let mut covariance = errors.moved * errors.moved.transpose();
+        let mut noise = covariance.fixed_view_mut::<3, 3>(0, 0);
+        noise += fit.by_motion * found.covariance * fit.by_motion.transpose();
+        let mean = errors.mean.0.fixed_rows::<3>(0).into_owned();
+        let Some(left) = found.leftover.as_ref().filter(|_| errors.count > PASSING) else { return (mean, covariance) };
+        // Ground that is no plane bends the vectors by what it bends times the motion; and what all vectors share need
+        // not be the same all over the image.
+        let bend = (self.config.ground_bend_sd * found.tau.norm()).powi(2) + shared * shared;
+        let total = errors.seen * errors.seen.transpose() + left.covariance + Matrix3::identity() * bend;
+        let Some(inverse) = total.try_inverse() else { return (mean, covariance) };
+        let surprise = left.angle - errors.mean.1;
+        if surprise.dot(&(inverse * surprise)) > GATE {
+            self.bias.doubt();
+            return (mean, covariance);
+        }
+        let passing = errors.seen.fixed_columns::<PASSING>(0);
+        let (mount, noise) = (self.mount.matrix(), passing * passing.transpose() + left.covariance);
+        self.bias.take(&Shown {
+            angle: mount * left.angle,
+            interval_s: span.seconds,
+            noise: mount * noise * mount.transpose(),
+            lasting: bend,
+        });
+        let mut both: Matrix6x3<f64> = errors.moved * errors.seen.transpose();
+        let mut with_noise = both.fixed_rows_mut::<3>(0);
+        with_noise += fit.by_motion * left.with_motion;
+        let gain = both * inverse;
+        let mut known = gain * both.transpose();
+        // The rates stay the gyro's, less the bias: a filter that has the gyro is not told the flow's word twice.
+        known.fixed_view_mut::<3, 3>(3, 3).fill(0.0);
+        (mean + gain.fixed_rows::<3>(0) * surprise, covariance - known)
+    }
+}
+
+/// The fit in the newer body's axes.
+struct Fitted {
+    /// Change of the linear velocity with τ and the normal's lean.
+    by_motion: Matrix3x5<f64>,
+    /// The camera's velocity, and the body's.
+    camera: Vector3<f64>,
+    linear: Vector3<f64>,
+    /// From the body to the camera, metres.
+    arm: Vector3<f64>,
+}
+
+impl Ground {
+    /// By what part the distance grows with a tilt of the normal: what is wrong about the one is wrong about the other.
+    fn longer(&self, tilt: &Vector3<f64>) -> f64 {
+        self.distance.as_ref().map_or(0.0, |d| tilt.dot(&d.hit) / d.metres)
+    }
+}
+
+/// Nothing is known of the rates: they are not correlated with anything, and anything they may be.
+fn unobserved(covariance: &mut Matrix6<f64>) {
+    covariance.fixed_view_mut::<3, 3>(0, 3).fill(0.0);
+    covariance.fixed_view_mut::<3, 3>(3, 0).fill(0.0);
+    covariance.fixed_view_mut::<3, 3>(3, 3).copy_from(&(Matrix3::identity() * UNOBSERVED));
+}
