@@ -180,7 +180,8 @@ impl Odometer {
         let total = errors.seen * errors.seen.transpose() + left.covariance + Matrix3::identity() * bend;
         let Some(inverse) = total.try_inverse() else { return (mean, covariance) };
         let surprise = left.angle - errors.mean.1;
-        if surprise.dot(&(inverse * surprise)) > GATE {
+        let odds = surprise.dot(&(inverse * surprise));
+        if odds.is_nan() || odds > GATE {
             self.bias.doubt();
             return (mean, covariance);
         }
