@@ -8,7 +8,6 @@ use super::linear::invert;
 const MEMORY_S: f64 = 30.0;
 /// Steps that err alike: frames of a hover show the same texture.
 const ALIKE: f64 = 4.0;
-
 /// What is left of what is known after a step that it does not explain: a bias that jumped is not held for half a minute.
 const DOUBTED: f64 = 0.8;
 

@@ -5,6 +5,8 @@
 //! the turn that the gyro says and Δω the change of its rate over the interval, a flow that turns 1 + ε times as far, a
 //! gyro clock that is δ ahead and a bias β give −ρ = εθ + δΔω − βΔt. The steps of about half a minute are fitted by
 //! weighted least squares; that Δω is noisy too, by as much as the gyro's samples are, is taken out of its square.
+//! β is there so that it is not taken for the others; what is taken off the gyro is learnt from all steps (`bias`), each
+//! by what it can show.
 
 use std::fmt;
 

@@ -8,7 +8,7 @@
 //! of their errors together, for a tilted plane bends vectors too). What it says of the gyro's bias is kept for the
 //! steps to come.
 
-use nalgebra::{Matrix3, Matrix3x5, Matrix6, Matrix6x3, SMatrix, SVector, Vector3};
+use nalgebra::{Matrix3, Matrix3x5, Matrix6, Matrix6x3, SMatrix, Vector3};
 
 use super::{
     Odometer, Scale, Velocity,
@@ -29,23 +29,32 @@ const ERRORS: usize = PASSING + 3;
 /// step of a thousand, by chance.
 const GATE: f64 = 16.3;
 
-/// What errs, a column each: by one deviation of it, …
+/// What an error does, …
+#[derive(Debug, Clone, Copy, Default)]
+struct Effect {
+    /// … m/s and rad/s that the estimate has more than the truth, …
+    linear: Vector3<f64>,
+    angular: Vector3<f64>,
+    /// … and radians, optical axes, of turn that it leaves in the vectors.
+    seen: Vector3<f64>,
+}
+
+/// What errs: a column each for one deviation of it.
 #[derive(Default)]
 struct Errors {
-    /// … the estimate less the truth in (linear, angular), …
+    /// (linear, angular).
     moved: SMatrix<f64, 6, ERRORS>,
-    /// … and the turn that is left in the vectors, radians, optical axes.
     seen: SMatrix<f64, 3, ERRORS>,
     count: usize,
-    /// What the bias that is believed in has done to both.
-    mean: (SVector<f64, 6>, Vector3<f64>),
+    /// What the bias that is believed in does.
+    expected: Effect,
 }
 
 impl Errors {
-    fn add(&mut self, linear: Vector3<f64>, angular: Vector3<f64>, seen: Vector3<f64>) {
-        self.moved.fixed_view_mut::<3, 1>(0, self.count).copy_from(&linear);
-        self.moved.fixed_view_mut::<3, 1>(3, self.count).copy_from(&angular);
-        self.seen.set_column(self.count, &seen);
+    fn add(&mut self, deviation: Effect) {
+        self.moved.fixed_view_mut::<3, 1>(0, self.count).copy_from(&deviation.linear);
+        self.moved.fixed_view_mut::<3, 1>(3, self.count).copy_from(&deviation.angular);
+        self.seen.set_column(self.count, &deviation.seen);
         self.count += 1;
     }
 }
@@ -85,7 +94,7 @@ impl Odometer {
         let errors = self.errors(turn, ground, found, span, &fitted, shared);
         let (shift, mut covariance) = self.learn(&errors, found, span, &fitted, shared);
         let linear = fitted.linear - shift;
-        let angular = turn.mean - errors.mean.0.fixed_rows::<3>(3);
+        let angular = turn.mean - errors.expected.angular;
         if turn.swing_variance.is_none() {
             unobserved(&mut covariance);
         }
@@ -112,48 +121,46 @@ impl Odometer {
         let (config, interval_s) = (&self.config, span.seconds);
         let to_camera = self.mount.inverse();
         let mut errors = Errors::default();
-        // An error of the turn, in the older body's axes, as it reaches the velocity and the mean rate.
+        // An error of the turn, in the older body's axes.
         let by_turn = fit.by_motion * found.by_turn * to_camera.matrix();
-        let turned = |error: Vector3<f64>| (by_turn * error - (error / interval_s).cross(&fit.arm), error / interval_s);
+        let turned = |error: Vector3<f64>| Effect {
+            linear: by_turn * error - (error / interval_s).cross(&fit.arm),
+            angular: error / interval_s,
+            seen: to_camera * error,
+        };
         for axis in 0..3 {
-            let error = Vector3::ith(axis, turn.variance.sqrt());
-            let (v, w) = turned(error);
-            errors.add(v, w, to_camera * error);
+            errors.add(turned(Vector3::ith(axis, turn.variance.sqrt())));
         }
-        let error = (turn.last - turn.first) * config.gyro_offset_sd_s;
-        let (v, w) = turned(error);
-        errors.add(v, w, to_camera * error);
+        errors.add(turned((turn.last - turn.first) * config.gyro_offset_sd_s));
         for (rate, sign) in [(turn.first, -1.0), (turn.last, 1.0)] {
             let jitter = config.stamp_jitter_sd_s * sign;
-            let (v, w) = turned(rate * jitter);
-            let longer = jitter / interval_s;
-            errors.add(v - fit.linear * longer, w - turn.mean * longer, to_camera * (rate * jitter));
+            let (by_turn, longer) = (turned(rate * jitter), jitter / interval_s);
+            errors.add(Effect {
+                linear: by_turn.linear - fit.linear * longer,
+                angular: by_turn.angular - turn.mean * longer,
+                ..by_turn
+            });
         }
         let (by_normal, by_shift) =
             found.leftover.as_ref().map_or_else(Default::default, |left| (left.by_normal, left.by_shift));
-        let still = Vector3::zeros();
         for tangent in ground.tangents {
             let tilt = tangent * ground.tilt_sd;
             let moved = fit.by_motion.fixed_columns::<3>(0) * (found.by_normal * (to_camera * tilt));
-            errors.add(moved - fit.camera * ground.longer(&tilt), still, by_normal * (to_camera * tilt));
+            let linear = moved - fit.camera * ground.longer(&tilt);
+            errors.add(Effect { linear, seen: by_normal * (to_camera * tilt), ..Effect::default() });
         }
         for axis in 0..2 {
-            let moved = fit.by_motion * found.by_shift.column(axis) * shared;
-            errors.add(moved, still, by_shift.column(axis) * shared);
+            let linear = fit.by_motion * found.by_shift.column(axis) * shared;
+            errors.add(Effect { linear, seen: by_shift.column(axis) * shared, ..Effect::default() });
         }
         let part = ground.distance.as_ref().map_or(0.0, |d| d.sd / d.metres);
-        errors.add(fit.camera * part, still, still);
+        errors.add(Effect { linear: fit.camera * part, ..Effect::default() });
         if turn.swing_variance.is_some() {
             let believed = self.bias.believed(config.gyro_bias_sd_rad_s);
-            for column in believed.root.column_iter() {
-                let error = column * interval_s;
-                let (v, w) = turned(error);
-                errors.add(v, w, to_camera * error);
+            for deviation in believed.root.column_iter() {
+                errors.add(turned(deviation * interval_s));
             }
-            let (v, w) = turned(believed.mean * interval_s);
-            errors.mean.0.fixed_rows_mut::<3>(0).copy_from(&v);
-            errors.mean.0.fixed_rows_mut::<3>(3).copy_from(&w);
-            errors.mean.1 = to_camera * (believed.mean * interval_s);
+            errors.expected = turned(believed.mean * interval_s);
         }
         errors
     }
@@ -172,14 +179,14 @@ impl Odometer {
         let mut covariance = errors.moved * errors.moved.transpose();
         let mut noise = covariance.fixed_view_mut::<3, 3>(0, 0);
         noise += fit.by_motion * found.covariance * fit.by_motion.transpose();
-        let mean = errors.mean.0.fixed_rows::<3>(0).into_owned();
+        let mean = errors.expected.linear;
         let Some(left) = found.leftover.as_ref().filter(|_| errors.count > PASSING) else { return (mean, covariance) };
         // Ground that is no plane bends the vectors by what it bends times the motion; and what all vectors share need
         // not be the same all over the image.
         let bend = (self.config.ground_bend_sd * found.tau.norm()).powi(2) + shared * shared;
         let total = errors.seen * errors.seen.transpose() + left.covariance + Matrix3::identity() * bend;
         let Some(inverse) = total.try_inverse() else { return (mean, covariance) };
-        let surprise = left.angle - errors.mean.1;
+        let surprise = left.angle - errors.expected.seen;
         let odds = surprise.dot(&(inverse * surprise));
         if odds.is_nan() || odds > GATE {
             self.bias.doubt();

@@ -48,8 +48,8 @@ pub struct Velocity {
     /// rad/s, mean over the interval, body frame: the gyro's, less the bias that the flow has shown so far.
     pub angular: [f64; 3],
     /// Row-major over (linear, angular): flow noise by the residuals and the number of effectively independent vectors,
-    /// gyro, range, tilt and stamps by the settings or their messages. An axis that was not observed has a large
-    /// variance, never 0.
+    /// gyro, range, tilt and stamps by the settings or their messages, less what the vectors show of their errors. An axis
+    /// that was not observed has a large variance, never 0.
     pub covariance: [[f64; 6]; 6],
     /// Whether `linear` is metric.
     pub scale: Scale,
