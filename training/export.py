@@ -24,8 +24,6 @@ from raft import RaftSmall
 OPSET = 17
 # Of operators that are not ONNX's own, and their version.
 DOMAIN, DOMAIN_VERSION = "nightflow", 1
-# The most tensors that the node's `Convolutions` reads as one.
-PARTS_MAX = 8
 FRAMES = ("older", "newer")
 LARGEST_FILE = 20_000_000
 PARITY_PX = 1e-3
@@ -89,17 +87,15 @@ class Convolutions(torch.autograd.Function):
     definition stands in models/README.md; tracing asks for shapes only."""
 
     @staticmethod
-    def forward(ctx, bits: int, parts: int, dilations: list[int], slopes: list[float], kept: bool, *tensors):
+    def forward(ctx, settings: dict, parts: int, dilations: list[int], slopes: list[float], kept: bool, *tensors):
         channels = [bias.numel() for bias in tensors[parts + 1 :: 2]]
         of = lambda count: tensors[0].new_zeros(1, count, *tensors[0].shape[2:])
         return (of(channels[-1]), of(channels[-2])) if kept else of(channels[-1])
 
     @staticmethod
-    def symbolic(g, bits: int, parts: int, dilations: list[int], slopes: list[float], kept: bool, *tensors):
+    def symbolic(g, settings: dict, parts: int, dilations: list[int], slopes: list[float], kept: bool, *tensors):
         channels = [bias.type().sizes()[0] for bias in tensors[parts + 1 :: 2]]
-        settings = {"parts_i": parts, "dilations_i": dilations, "slopes_f": slopes}
-        # 16 is what it is if nothing is said.
-        settings |= {"bits_i": bits} if bits != 16 else {}
+        settings = settings | {"parts_i": parts, "dilations_i": dilations, "slopes_f": slopes}
         found = g.op(f"{DOMAIN}::Convolutions", *tensors, outputs=2 if kept else 1, **settings)
         for value, count in zip(found if kept else [found], reversed(channels)):
             value.setType(tensors[0].type().with_sizes([1, count, None, None]))
@@ -176,19 +172,15 @@ def convolutions_of(layers: nn.Module) -> tuple[list[nn.Conv2d], list[float]]:
     return [part for part, _ in both], [slope for _, slope in both]
 
 
-def chained(layers: nn.Module, parts: list[torch.Tensor], kept: bool = False, *, bits: int):
-    """What `networks.through` gives, by the one operator; with `kept` also what the layer before the last gives."""
+def chained(layers: nn.Module, parts: list[torch.Tensor], kept: bool = False, dense: bool = False, *, bits: int):
+    """What `networks.through` gives, by the one operator; with `kept` also what the layer before the last gives; of `dense`
+    layers each reads all that there is before it."""
     convolutions, slopes = convolutions_of(layers)
     weights = [tensor for convolution in convolutions for tensor in (convolution.weight, convolution.bias)]
     dilations = [convolution.dilation[0] for convolution in convolutions]
-    return Convolutions.apply(bits, len(parts), dilations, slopes, kept, *parts, *weights)
-
-
-def dense_layers(level: LevelDecoder, parts: list[torch.Tensor]):
-    """A dense level's own layers. Where its last convolution would read more parts than the operator takes, all but the cost
-    volume, which are small, become one beforehand."""
-    few = len(parts) + len(level.body) <= PARTS_MAX
-    return LevelDecoder.layers(level, parts if few else [parts[0], torch.cat(parts[1:], 1)])
+    # 16 and 0 is what they are if nothing is said.
+    settings = ({"bits_i": bits} if bits != 16 else {}) | ({"dense_i": 1} if dense else {})
+    return Convolutions.apply(settings, len(parts), dilations, slopes, kept, *parts, *weights)
 
 
 @contextlib.contextmanager
@@ -215,10 +207,8 @@ def fused(network: PwcNet, bits: int = 32):
         match = lambda older, newer, flow, tile, fetch, level=level: CostVolume.apply(
             older, newer, flow, level.sharpness, level.reach
         )
-        layers = lambda parts, level=level: chain(nn.Sequential(level.body, level.predict), parts, kept=True)
-        if level.dense:
-            layers = functools.partial(dense_layers, level)
-        parts += [(level, "match", match), (level, "layers", layers), (level, "through", chain)]
+        layers = lambda parts, level=level: chain(nn.Sequential(level.body, level.predict), parts, kept=True, dense=level.dense)
+        parts += [(level, "match", match), (level, "layers", layers)]
     return exchanged(parts)
 
 

@@ -182,8 +182,6 @@ class LevelDecoder(nn.Module):
         offsets = torch.arange(-reach, reach + 1, dtype=torch.float32)
         dy, dx = torch.meshgrid(offsets, offsets, indexing="ij")
         self.register_buffer("offsets", torch.stack([dx.flatten(), dy.flatten()]), persistent=False)
-        # What export.py exchanges for an operator of the node's own.
-        self.through = through
 
     def match(self, older, newer, flow, tile, fetch):
         """GAIN times the cost volume around the flow, and its soft arg-max. One operator in the fused graph of export.py."""
@@ -194,12 +192,11 @@ class LevelDecoder(nn.Module):
         return volume * GAIN, torch.einsum("bdyx,cd->bcyx", weights, self.offsets)
 
     def layers(self, parts):
-        """The residual in fp32, and the body's features. One operator in the bf16 graph of export.py, of a dense body one for
-        each convolution."""
+        """The residual in fp32, and the body's features. One operator in the fused graphs of export.py."""
         if self.dense:
             for layer in self.body:
-                parts = [*parts, self.through(layer, parts)]
-            return self.through(self.predict, parts).float(), parts[-1]
+                parts = [*parts, through(layer, parts)]
+            return through(self.predict, parts).float(), parts[-1]
         features = through(self.body, parts)
         return self.predict(features).float(), features
 

@@ -13,7 +13,7 @@ import torch
 import checkpoints
 import dense
 import int8
-from export import (GOLDEN_COLUMNS, GOLDEN_ROWS, OPSET, PARTS_MAX, USUAL_STRIDE, Exported, gigamacs, golden_frames, graphs_of,
+from export import (GOLDEN_COLUMNS, GOLDEN_ROWS, OPSET, USUAL_STRIDE, Exported, gigamacs, golden_frames, graphs_of,
                     halved_as_one, manifest_entry, moved, parity, rounded, traced, twice_as_one, write_manifest)
 from flownet import FlowNetS
 from networks import STRIDE, PwcNet, halved, twice
@@ -147,15 +147,10 @@ def test_the_bf16_graphs_are_called_alike_and_convolve_by_their_operators(fresh)
         of = lambda node, name: next(onnx.helper.get_attribute_value(a) for a in node.attribute if a.name == name)
         parts, layers = [of(node, "parts") for node in chains], [len(of(node, "slopes")) for node in chains]
         # Levels 5, 4, 3 and 3 again, the context network, level 2, a head for the expected error.
-        if network.decoder.shared.dense:
-            # What a shared body reads beside the volume is one part, or its last convolutions would read too many.
-            assert parts == 4 * [2, 3, 4, 5, 6, 7] + [2] + [5, 6, 7, 8] + [1]
-            assert layers == 24 * [1] + [6] + 4 * [1] + [2] and all(len(node.output) == 1 for node in chains)
-            assert [of(node, "slopes") == [1.0] for node in chains[:6]] == [False] * 5 + [True]
-        else:
-            assert parts == [5, 5, 5, 5, 2] + ([1] if network.fast else [5, 1])
-            assert np.allclose(of(chains[0], "slopes"), [0.1] * 5 + [1.0])
-        assert max(parts) <= PARTS_MAX
+        assert parts == [5, 5, 5, 5, 2] + ([1] if network.fast else [5, 1])
+        assert np.allclose(of(chains[0], "slopes"), [0.1] * 5 + [1.0])
+        dense = [any(a.name == "dense" for a in node.attribute) for node in chains]
+        assert dense == [network.decoder.shared.dense and count == 5 for count in parts]
         dilations = [of(node, "dilations") for node in chains]
         assert [given for given in dilations if set(given) != {1}] == [[1, 2, 4, 8, 1, 1]]
         for node in chains:

@@ -14,7 +14,9 @@ use crate::flow::bands::Band;
 pub struct Chain {
     unit: Unit,
     layers: Vec<Layer>,
-    /// What each layer reads.
+    /// Whether a layer reads all maps before it.
+    dense: bool,
+    /// What goes in, and what each layer but the last gives.
     maps: Vec<Map>,
 }
 
@@ -60,10 +62,11 @@ pub fn fits(
 }
 
 impl Chain {
-    /// Layers that keep the size, each with as many inputs as the one before has outputs; at least one.
-    pub fn new(unit: Unit, layers: Vec<Layer>) -> Self {
+    /// Layers that keep the size, at least one; each reads what the one before gives or, in a `dense` chain, all that there is
+    /// before it: first what goes in, then what layers gave in their order.
+    pub fn new(unit: Unit, layers: Vec<Layer>, dense: bool) -> Self {
         let maps = layers.iter().map(|_| Map::default()).collect();
-        Self { unit, layers, maps }
+        Self { unit, layers, dense, maps }
     }
 
     /// Channels that come out, and those of the layer before the last.
@@ -84,8 +87,11 @@ impl Chain {
         let inputs = self.layers.first().map_or(0, Layer::inputs);
         fits([inputs, self.layers.len()], self.outputs(), parts, [height, width], last.len(), before.as_deref())?;
         let cells = height * width;
-        for (layer, map) in self.layers.iter().zip(&mut self.maps) {
-            map.resize([layer.inputs(), height, width], layer.margin());
+        let channels = std::iter::once(inputs).chain(self.layers.iter().map(Layer::outputs));
+        for (index, (map, channels)) in self.maps.iter_mut().zip(channels).enumerate() {
+            let end = if self.dense { self.layers.len() } else { index + 1 };
+            let margin = self.layers[index..end].iter().map(Layer::margin).max();
+            map.resize([channels, height, width], margin.unwrap_or(0));
         }
         let (rows, bands) = Map::bands(height);
         let [first, ..] = &mut self.maps[..] else { return Ok(()) };
@@ -107,7 +113,8 @@ impl Chain {
                 _ => None,
             };
             let to = To { map: written.first_mut(), planes, sums: None };
-            layer.run(unit, &read[index], to, spread)?;
+            let read = if self.dense { &read[..] } else { &read[index..] };
+            layer.run(unit, read, to, spread)?;
         }
         Ok(())
     }

@@ -1,6 +1,8 @@
 //! RAFT-small's feature encoder (Teed and Deng 2020), each convolution but the last one followed by an instance norm, and what
 //! is projected from its levels.
 
+use std::slice;
+
 use super::{
     Spread,
     layer::{Layer, Step, To},
@@ -127,7 +129,7 @@ impl Normed {
         let [height, width] = layer.size_of(from.height, from.width);
         map.resize([layer.outputs(), height, width], margin);
         sums.resize(layer.sums(height), 0.0);
-        layer.run(unit, from, To { map: Some(map), planes: None, sums: Some(sums) }, spread)?;
+        layer.run(unit, slice::from_ref(from), To { map: Some(map), planes: None, sums: Some(sums) }, spread)?;
         let whole = scale.len();
         for channel in 0..layer.outputs() {
             let total = |offset: usize| -> f64 {
@@ -308,11 +310,11 @@ impl Encoder {
         }
         let planes = |planes| To { map: None, planes: Some(planes), sums: None };
         let Self { units, last, eighth: map, projections: [of_quarter, of_eighth], .. } = self;
-        of_quarter.run(unit, &units[QUARTER].last.map, planes(quarter), spread)?;
+        of_quarter.run(unit, slice::from_ref(&units[QUARTER].last.map), planes(quarter), spread)?;
         map.resize([last.outputs(), height / 8, width / 8], 0);
-        let from = &units[2 * STRIDES.len() - 1].last.map;
+        let from = slice::from_ref(&units[2 * STRIDES.len() - 1].last.map);
         last.run(unit, from, To { map: Some(map), ..planes(eighth) }, spread)?;
-        of_eighth.run(unit, map, planes(projected), spread)
+        of_eighth.run(unit, slice::from_ref(map), planes(projected), spread)
     }
 
     /// The image as the first convolution reads it: a pixel for every second column, with that column and three on either

@@ -24,11 +24,19 @@ pub struct Step {
 pub struct Layer {
     step: Step,
     outputs: usize,
-    inputs: usize,
     size: [usize; 2],
+    /// The maps that it reads.
+    reads: Vec<Read>,
+    /// For each [`LANES`] outputs those of each map.
     weights: Vec<Line>,
     /// For whole lines of outputs.
     bias: Vec<f32>,
+}
+
+/// A map that is read.
+#[derive(Debug)]
+struct Read {
+    channels: usize,
     /// Where each step of the tiles reads, for maps of one stride.
     offsets: Vec<usize>,
     offsets_for: Option<usize>,
@@ -51,34 +59,54 @@ impl Layer {
     /// # Panics
     ///
     /// If there are not as many weights and biases as that.
-    pub fn new(weights: &[f32], [outputs, inputs, rows, columns]: [usize; 4], bias: &[f32], step: Step) -> Self {
+    pub fn new(weights: &[f32], shape: [usize; 4], bias: &[f32], step: Step) -> Self {
+        Self::of_maps(weights, shape, &[shape[1]], bias, step)
+    }
+
+    /// The same for inputs that are those of several maps, of so many channels.
+    ///
+    /// # Panics
+    ///
+    /// If there are not as many weights, biases and channels as that.
+    pub fn of_maps(
+        weights: &[f32],
+        [outputs, inputs, rows, columns]: [usize; 4],
+        read: &[usize],
+        bias: &[f32],
+        step: Step,
+    ) -> Self {
         assert!(weights.len() == outputs * inputs * rows * columns && (bias.is_empty() || bias.len() == outputs));
-        let depth = inputs.div_ceil(LANES);
-        let weight = |o: usize, i: usize, tap: usize| {
-            if o < outputs && i < inputs { narrowed(weights[(o * inputs + i) * rows * columns + tap]) } else { 0 }
-        };
-        let mut packed = Vec::with_capacity(outputs.div_ceil(LANES) * rows * columns * depth * STEP);
+        assert!(read.iter().sum::<usize>() == inputs, "{inputs} inputs of {read:?}");
+        let mut packed = vec![];
         for first in (0..outputs).step_by(LANES) {
-            for tap in 0..rows * columns {
-                for input in (0..depth * LANES).step_by(LANES) {
-                    for output in (first..first + LANES).step_by(SIDE) {
-                        // A line of a tile has two inputs of each of 16 outputs.
-                        for two in (input..input + LANES).step_by(2) {
-                            packed.push(Line(std::array::from_fn(|j| weight(output + j / 2, two + j % 2, tap))));
+            let mut before = 0;
+            for &channels in read {
+                let weight = |o: usize, i: usize, tap: usize| {
+                    let at = (o * inputs + before + i) * rows * columns + tap;
+                    if o < outputs && i < channels { narrowed(weights[at]) } else { 0 }
+                };
+                for tap in 0..rows * columns {
+                    for input in (0..channels).step_by(LANES) {
+                        for output in (first..first + LANES).step_by(SIDE) {
+                            // A line of a tile has two inputs of each of 16 outputs.
+                            for two in (input..input + LANES).step_by(2) {
+                                packed.push(Line(std::array::from_fn(|j| weight(output + j / 2, two + j % 2, tap))));
+                            }
                         }
                     }
                 }
+                before += channels;
             }
         }
         let mut whole = vec![0.0; outputs.next_multiple_of(LANES)];
         whole[..bias.len()].copy_from_slice(bias);
-        let size = [rows, columns];
-        Self { step, outputs, inputs, size, weights: packed, bias: whole, offsets: vec![], offsets_for: None }
+        let reads = read.iter().map(|channels| Read { channels: *channels, offsets: vec![], offsets_for: None });
+        Self { step, outputs, size: [rows, columns], reads: reads.collect(), weights: packed, bias: whole }
     }
 
     /// Channels that go in.
     pub fn inputs(&self) -> usize {
-        self.inputs
+        self.reads.iter().map(|read| read.channels).sum()
     }
 
     /// Channels that come out.
@@ -102,24 +130,32 @@ impl Layer {
     }
 
     /// Where the steps read, which is the same until the input's width changes.
-    fn locate(&mut self, from: &Map) {
-        if self.offsets_for == Some(from.stride()) {
-            return;
+    fn locate(&mut self, from: &[Map]) {
+        let ([rows, columns], dilation) = (self.size, self.step.dilation);
+        for (read, from) in self.reads.iter_mut().zip(from) {
+            if read.offsets_for == Some(from.stride()) {
+                continue;
+            }
+            read.offsets.clear();
+            for tap in 0..rows * columns {
+                let at = from.at(tap / columns * dilation, tap % columns * dilation);
+                read.offsets.extend((0..from.depth()).map(|line| at + line));
+            }
+            read.offsets_for = Some(from.stride());
         }
-        let ([rows, columns], dilation, depth) = (self.size, self.step.dilation, from.depth());
-        self.offsets.clear();
-        for tap in 0..rows * columns {
-            let at = from.at(tap / columns * dilation, tap % columns * dilation);
-            self.offsets.extend((0..depth).map(|line| at + line));
-        }
-        self.offsets_for = Some(from.stride());
     }
 
-    /// Computes everything.
-    pub fn run<E>(&mut self, unit: Unit, from: &Map, to: To<'_>, spread: &impl Spread<E>) -> Result<(), E> {
-        assert!(from.channels == self.inputs && from.margin >= self.margin(), "{} channels", from.channels);
+    /// Computes everything, from maps of one size.
+    pub fn run<E>(&mut self, unit: Unit, from: &[Map], to: To<'_>, spread: &impl Spread<E>) -> Result<(), E> {
+        let (margin, [first, ..]) = (self.margin(), from) else { return Ok(()) };
+        let fits = |(read, map): (&Read, &Map)| {
+            read.channels == map.channels
+                && map.margin >= margin
+                && [map.height, map.width] == [first.height, first.width]
+        };
+        assert!(from.len() == self.reads.len() && self.reads.iter().zip(from).all(fits), "{} channels", self.inputs());
         self.locate(from);
-        let (layer, [height, width]) = (&*self, self.size_of(from.height, from.width));
+        let (layer, [height, width]) = (&*self, self.size_of(first.height, first.width));
         let (rows, bands) = Map::bands(height);
         let (mut margin, mut depth) = (0, 0);
         let map = to.map.map(|map| {
@@ -146,7 +182,7 @@ impl Layer {
 /// Some rows of the output.
 struct Convolve<'a> {
     layer: &'a Layer,
-    from: &'a Map,
+    from: &'a [Map],
     rows: [usize; 2],
     width: usize,
     number: usize,
@@ -160,9 +196,8 @@ struct Convolve<'a> {
 impl Work for Convolve<'_> {
     #[inline(always)]
     fn on(mut self, begun: &Begun) {
-        let Layer { step: Step { stride: [down, right], dilation, .. }, size, offsets, weights, bias, .. } = self.layer;
-        let around = size.map(|length| self.from.margin - dilation * (length / 2));
-        let (from, panel) = (self.from, offsets.len() * STEP);
+        let Layer { step: Step { stride: [down, right], dilation, .. }, size, reads, weights, bias, .. } = self.layer;
+        let panel = reads.iter().map(|read| read.offsets.len()).sum::<usize>() * STEP;
         let mut sums = Sums::ZERO;
         for (group, (weights, bias)) in weights.chunks_exact(panel).zip(bias.as_chunks().0).enumerate() {
             let mut totals = [[0.0; LANES]; 2];
@@ -171,9 +206,16 @@ impl Work for Convolve<'_> {
                 for x in (0..self.width).step_by(SIDE) {
                     // The last tile of a row begins earlier, rather than reach beyond it.
                     let first = if self.width < SIDE { 0 } else { x.min(self.width - SIDE) };
-                    let starts = [y, second].map(|y| from.at(around[0] + down * y, around[1] + right * first));
-                    let stride = right * from.depth();
-                    begun.multiply(&Block { pixels: from.lines(), starts, stride, offsets, weights }, &mut sums);
+                    let mut rest = weights;
+                    for (number, (Read { offsets, .. }, from)) in reads.iter().zip(self.from).enumerate() {
+                        let around = size.map(|length| from.margin - dilation * (length / 2));
+                        let starts = [y, second].map(|y| from.at(around[0] + down * y, around[1] + right * first));
+                        let (weights, others) = rest.split_at(offsets.len() * STEP);
+                        let stride = right * from.depth();
+                        let block = Block { pixels: from.lines(), starts, stride, offsets, weights };
+                        begun.multiply(&block, number > 0, &mut sums);
+                        rest = others;
+                    }
                     let columns = [x, self.width.min(first + SIDE)];
                     for (half, y) in (0..1 + second - y).zip([y, second]) {
                         let skipped = x - first;

@@ -19,7 +19,7 @@ mod rows;
 pub(super) mod tests;
 mod tiles;
 
-pub use chain::Chain;
+pub use chain::{Chain, Unfit};
 pub use encoder::{CONVOLUTIONS, Encoder, View, Weights};
 pub use layer::{Layer, Step};
 pub use operator::{Convolutions, Encode};

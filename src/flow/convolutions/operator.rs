@@ -39,8 +39,9 @@ impl From<encoder::Unfit> for Error {
 
 /// `nightflow::Convolutions(part [1, C, H, W] …, weight [O, I, K, K], bias [O] …)`: the parts are read as if they were
 /// concatenated; each weight and bias is a layer that keeps the size. Attributes: how many `parts`, and for each layer one of
-/// `dilations` and of `slopes`, what negative results are multiplied with; and of how many `bits` the factors are, 16 (bf16) or
-/// 32, then for weights of 3 × 3 alone. Outputs: the last layer's and the one before's.
+/// `dilations` and of `slopes`, what negative results are multiplied with; of how many `bits` the factors are, 16 (bf16) or
+/// 32, then for weights of 3 × 3 alone; and whether the layers are `dense`: then each reads the parts and all that layers before it
+/// gave, in this order. Outputs: the last layer's and the one before's.
 pub struct Convolutions;
 
 /// `nightflow::Encoder(image [1, 3, H, W], weight, bias …)`: RAFT-small's feature encoder, convolutions in the order in which
@@ -120,22 +121,29 @@ impl Operator for Convolutions {
             return Err(Error::new(format!("{CHAIN}: parts, dilations and slopes don't fit: {found}")));
         }
         let bits: i64 = attributes.get("bits").unwrap_or(16);
-        let (mut narrow, mut wide, mut channels) = (vec![], vec![], None);
+        let dense = attributes.get::<i64>("dense").unwrap_or(0) != 0;
+        // Channels of all that there is to be read.
+        let (mut narrow, mut wide, mut channels) = (vec![], vec![], vec![]);
         for (number, (dilation, slope)) in dilations.into_iter().zip(slopes).enumerate() {
             let (shape, weights, bias) = layer(attributes, CHAIN, parts + 2 * number)?;
-            if channels.is_some_and(|channels| channels != shape[1]) {
-                let before = format!("{channels:?}");
+            if channels.is_empty() {
+                channels.push(shape[1]);
+            }
+            let read = if dense { &channels[..] } else { &channels[number..] };
+            if read.iter().sum::<usize>() != shape[1] {
                 return Err(Error::new(format!(
-                    "{CHAIN}: layer {number} should read {before} channels, it is {shape:?}"
+                    "{CHAIN}: layer {number} should read {read:?} channels, it is {shape:?}"
                 )));
             }
-            channels = Some(shape[0]);
             let dilation = dilation as usize;
             match (bits, shape) {
-                (16, _) => narrow.push(Layer::new(&weights, shape, &bias, Step { stride: [1; 2], dilation, slope })),
-                (32, [outputs, inputs, 3, 3]) => {
+                (16, _) => {
+                    let step = Step { stride: [1; 2], dilation, slope };
+                    narrow.push(Layer::of_maps(&weights, shape, read, &bias, step));
+                }
+                (32, [outputs, _, 3, 3]) => {
                     let unit = winograd::Unit::best();
-                    let mut layer = winograd::Layer::new(unit, &weights, [outputs, inputs], &bias, dilation, slope);
+                    let mut layer = winograd::Layer::new(unit, &weights, (outputs, read), &bias, dilation, slope);
                     layer.share(onnx_shared::first);
                     wide.push(layer);
                 }
@@ -144,10 +152,11 @@ impl Operator for Convolutions {
                     return Err(Error::new(format!("{CHAIN}: bits should be 16, or 32 for weights of 3 × 3: {found}")));
                 }
             }
+            channels.push(shape[0]);
         }
         let work = match bits {
-            32 => Work::ThirtyTwo(winograd::Chain::new(winograd::Unit::best(), wide)),
-            _ => Work::Sixteen(Chain::new(Unit::best(), narrow)),
+            32 => Work::ThirtyTwo(winograd::Chain::new(winograd::Unit::best(), wide, dense)),
+            _ => Work::Sixteen(Chain::new(Unit::best(), narrow, dense)),
         };
         Ok(ChainNode { parts, work })
     }

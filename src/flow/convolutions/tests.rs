@@ -111,7 +111,7 @@ fn apart(found: &[f32], wanted: &[f64]) -> f64 {
     (differences / square(&mut wanted.iter().copied()).max(1e-12)).sqrt()
 }
 
-fn chain_is_as_defined(sizes: [usize; 2], widths: &[usize], dilations: &[usize], seed: u64) {
+fn chain_is_as_defined(sizes: [usize; 2], widths: &[usize], dilations: &[usize], dense: bool, seed: u64) {
     let [height, width] = sizes;
     let cells = height * width;
     let last = widths.len() - 2;
@@ -121,14 +121,20 @@ fn chain_is_as_defined(sizes: [usize; 2], widths: &[usize], dilations: &[usize],
         .map(|(i, dilation)| Step { stride: [1; 2], dilation: *dilation, slope: if i == last { 1.0 } else { 0.1 } })
         .collect();
     let sizes: Vec<usize> = (0..=last).map(|i| if (seed as usize + i).is_multiple_of(3) { 1 } else { 3 }).collect();
-    let shape = |i: usize| [widths[i + 1], widths[i], sizes[i], sizes[i]];
+    let read = |i: usize| if dense { &widths[..=i] } else { &widths[i..=i] };
+    let shape = |i: usize| [widths[i + 1], read(i).iter().sum(), sizes[i], sizes[i]];
     let weights: Vec<Vec<f32>> = (0..=last).map(|i| noise(seed + 10 + i as u64, shape(i).iter().product())).collect();
     let bias: Vec<Vec<f32>> = (0..=last).map(|i| noise(seed + 50 + i as u64, widths[i + 1])).collect();
     let image = noise(seed, widths[0] * cells);
     let mut wanted =
         vec![Planes { values: image.iter().map(|v| f64::from(*v)).collect(), shape: [widths[0], height, width] }];
     for i in 0..=last {
-        let from = wanted[i].clone().rounded();
+        let mut from = wanted[i].clone();
+        if dense {
+            from.values = wanted.iter().flat_map(|planes| &planes.values).copied().collect();
+            from.shape[0] = shape(i)[1];
+        }
+        let from = from.rounded();
         wanted.push(from.convolved(&weights[i], shape(i), &bias[i], steps[i]));
     }
     let parts: Vec<&[f32]> = if widths[0] > 2 {
@@ -139,8 +145,8 @@ fn chain_is_as_defined(sizes: [usize; 2], widths: &[usize], dilations: &[usize],
     };
     let mut results: Vec<(Vec<f32>, Vec<f32>)> = vec![];
     for unit in Unit::all() {
-        let layers = (0..=last).map(|i| Layer::new(&weights[i], shape(i), &bias[i], steps[i])).collect();
-        let mut chain = Chain::new(unit, layers);
+        let layer = |i: usize| Layer::of_maps(&weights[i], shape(i), read(i), &bias[i], steps[i]);
+        let mut chain = Chain::new(unit, (0..=last).map(layer).collect(), dense);
         let mut both = (
             vec![f32::NAN; widths[last + 1] * cells],
             if last > 0 { vec![f32::NAN; widths[last] * cells] } else { vec![] },
@@ -167,9 +173,15 @@ fn chain_is_as_defined(sizes: [usize; 2], widths: &[usize], dilations: &[usize],
 
 #[test]
 fn a_chain_is_convolutions_one_after_the_other() {
-    chain_is_as_defined([8, 10], &[181, 128, 64, 3], &[1, 1, 1], 1);
-    chain_is_as_defined([32, 40], &[34, 64, 32, 2], &[2, 8, 1], 2);
-    chain_is_as_defined([2, 2], &[3, 33], &[4], 3);
+    chain_is_as_defined([8, 10], &[181, 128, 64, 3], &[1, 1, 1], false, 1);
+    chain_is_as_defined([32, 40], &[34, 64, 32, 2], &[2, 8, 1], false, 2);
+    chain_is_as_defined([2, 2], &[3, 33], &[4], false, 3);
+}
+
+#[test]
+fn in_a_dense_chain_each_reads_all_before_it() {
+    chain_is_as_defined([8, 10], &[181, 128, 64, 3], &[1, 1, 1], true, 1);
+    chain_is_as_defined([32, 40], &[34, 64, 32, 2], &[2, 4, 1], true, 2);
 }
 
 proptest! {
@@ -177,9 +189,9 @@ proptest! {
     #[test]
     fn a_chain_of_any_size_is_as_defined(
         height in 1usize..20, width in 1usize..40, inputs in 1usize..70, middle in 1usize..70, outputs in 1usize..70,
-        dilations in prop::array::uniform2(1usize..5), seed in 0u64..1000,
+        dilations in prop::array::uniform2(1usize..5), dense: bool, seed in 0u64..1000,
     ) {
-        chain_is_as_defined([height, width], &[inputs, middle, outputs], &dilations, seed);
+        chain_is_as_defined([height, width], &[inputs, middle, outputs], &dilations, dense, seed);
     }
 }
 

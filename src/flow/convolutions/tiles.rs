@@ -212,17 +212,17 @@ pub struct Block<'a> {
 }
 
 impl Begun {
-    /// The sums over all steps.
+    /// The sums over all steps, which with `add` go on from what they are.
     #[inline(always)]
-    pub fn multiply(&self, block: &Block<'_>, sums: &mut Sums) {
+    pub fn multiply(&self, block: &Block<'_>, add: bool, sums: &mut Sums) {
         let Block { pixels, starts, stride, offsets, weights } = *block;
         let furthest = offsets.last().map_or(0, |offset| offset + starts[0].max(starts[1]) + (SIDE - 1) * stride);
         assert!(!offsets.is_empty() && furthest < pixels.len() && weights.len() == offsets.len() * STEP, "{furthest}");
         match self.0 {
-            Unit::Plain => plain(block, sums),
+            Unit::Plain => plain(block, add, sums),
             #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
             // SAFETY: `Vectors` proves that the processor has them.
-            Unit::Dots(_) => unsafe { dots::multiply(block, sums) },
+            Unit::Dots(_) => unsafe { dots::multiply(block, add, sums) },
             #[cfg(all(target_arch = "x86_64", target_os = "linux"))]
             // SAFETY: `begin` has set the tiles' shapes; every line that is read was just seen to be there, since the last
             // offset is the greatest; `Sums` is as large as four tiles.
@@ -233,6 +233,12 @@ impl Begun {
                     "tilezero tmm1",
                     "tilezero tmm2",
                     "tilezero tmm3",
+                    "test {add:e}, {add:e}",
+                    "jz 2f",
+                    "tileloadd tmm0, [{sums} + {line}*1]",
+                    "tileloadd tmm1, [{sums} + {line}*1 + 1024]",
+                    "tileloadd tmm2, [{sums} + {line}*1 + 2048]",
+                    "tileloadd tmm3, [{sums} + {line}*1 + 3072]",
                     "2:",
                     "mov {at}, qword ptr [{offsets}]",
                     "shl {at}, 6",
@@ -254,6 +260,7 @@ impl Begun {
                     "tilestored [{sums} + {line}*1 + 1024], tmm1",
                     "tilestored [{sums} + {line}*1 + 2048], tmm2",
                     "tilestored [{sums} + {line}*1 + 3072], tmm3",
+                    add = in(reg) u32::from(add),
                     at = out(reg) _,
                     from = out(reg) _,
                     offsets = inout(reg) offsets.as_ptr() => _,
@@ -282,8 +289,10 @@ impl Begun {
 
 /// The definition of the product.
 #[inline(always)]
-fn plain(block: &Block<'_>, sums: &mut Sums) {
-    sums.0 = [[[0.0; SIDE]; SIDE]; 4];
+fn plain(block: &Block<'_>, add: bool, sums: &mut Sums) {
+    if !add {
+        *sums = Sums::ZERO;
+    }
     for (offset, weights) in block.offsets.iter().zip(block.weights.chunks_exact(STEP)) {
         for (half, start) in block.starts.into_iter().enumerate() {
             for pixel in 0..SIDE {
@@ -348,12 +357,14 @@ mod tests {
         let offsets = [0, 5, 90];
         let block = Block { pixels: &pixels, starts: [0, 40], stride: 3, offsets: &offsets, weights: &weights };
         let mut wanted = Sums::ZERO;
-        plain(&block, &mut wanted);
+        plain(&block, false, &mut wanted);
         for unit in Unit::all() {
-            let mut found = Sums::ZERO;
-            unit.begin().multiply(&block, &mut found);
-            for (a, b) in wanted.0.iter().flatten().flatten().zip(found.0.iter().flatten().flatten()) {
-                assert!((a - b).abs() < 1e-3, "{unit:?}: {a}, {b}");
+            let (mut found, begun) = (Sums::ZERO, unit.begin());
+            for (add, times) in [(false, 1.0), (true, 2.0), (false, 1.0)] {
+                begun.multiply(&block, add, &mut found);
+                for (a, b) in wanted.0.iter().flatten().flatten().zip(found.0.iter().flatten().flatten()) {
+                    assert!((times * a - b).abs() < 2e-3, "{unit:?}: {times} times {a}, {b}");
+                }
             }
         }
     }

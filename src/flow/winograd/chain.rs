@@ -18,7 +18,9 @@ use crate::flow::{
 pub struct Chain {
     unit: Unit,
     layers: Vec<Layer>,
-    /// What each layer reads, and what the last one gives.
+    /// Whether a layer reads all maps before it.
+    dense: bool,
+    /// What goes in, and what each layer gives.
     maps: Vec<Pixels>,
     own: Own,
 }
@@ -47,10 +49,11 @@ impl Own {
 }
 
 impl Chain {
-    /// Layers for this unit, each with as many inputs as the one before has outputs; at least one.
-    pub fn new(unit: Unit, layers: Vec<Layer>) -> Self {
+    /// Layers for this unit, at least one; each reads what the one before gives or, in a `dense` chain, all that there is before
+    /// it: first what goes in, then what layers gave in their order.
+    pub fn new(unit: Unit, layers: Vec<Layer>, dense: bool) -> Self {
         let maps = (0..=layers.len()).map(|_| Pixels::default()).collect();
-        Self { unit, layers, maps, own: Own::default() }
+        Self { unit, layers, dense, maps, own: Own::default() }
     }
 
     /// Channels that come out, and those of the layer before the last.
@@ -72,7 +75,7 @@ impl Chain {
         let inputs = self.layers.first().map_or(0, Layer::inputs);
         fits([inputs, self.layers.len()], self.outputs(), parts, size, last.len(), before.as_deref())?;
         self.resize(size);
-        let Self { unit, layers, maps, own } = self;
+        let Self { unit, layers, dense, maps, own } = self;
         let (unit, count) = (*unit, layers.len());
         let rows = height.div_ceil(PACKED);
         let ([margin, _], depth) = (maps[0].margins, maps[0].depth());
@@ -84,7 +87,8 @@ impl Chain {
         })?;
         for (index, layer) in layers.iter().enumerate() {
             let (read, written) = maps.split_at_mut(index + 1);
-            convolve(unit, layer, &read[index], &mut written[0], own, spread)?;
+            let read = if *dense { &read[..] } else { &read[index..] };
+            convolve(unit, layer, read, &mut written[0], own, spread)?;
         }
         unpack(unit, &maps[count], last, spread)?;
         before.map_or(Ok(()), |before| unpack(unit, &maps[count - 1], before, spread))
@@ -93,14 +97,18 @@ impl Chain {
     /// Memory for pictures of this size.
     fn resize(&mut self, [height, width]: [usize; 2]) {
         let (mut bands, mut each) = (0, 0);
-        for (index, map) in self.maps.iter_mut().enumerate() {
-            let Some(layer) = self.layers.get(index) else { break };
-            map.resize([layer.inputs(), height, width], layer.margins());
+        for layer in &mut self.layers {
+            layer.fit([height, width]);
             bands = bands.max(layer.bands([height, width]));
             each = each.max(layer.scratch([height, width]));
         }
-        if let (Some(map), Some(layer)) = (self.maps.last_mut(), self.layers.last()) {
-            map.resize([layer.outputs(), height, width], [0; 2]);
+        let given = self.layers.iter().map(Layer::outputs);
+        let channels = self.layers.first().map(Layer::inputs).into_iter().chain(given);
+        for (index, (map, channels)) in self.maps.iter_mut().zip(channels).enumerate() {
+            let after = &self.layers[index..];
+            let readers = if self.dense { after } else { after.get(..1).unwrap_or(&[]) };
+            let most = |of: usize| readers.iter().map(|layer| layer.margins()[of]).max().unwrap_or(0);
+            map.resize([channels, height, width], [most(0), most(1)]);
         }
         self.own.resize(bands, each);
     }
@@ -112,12 +120,12 @@ const PACKED: usize = 8;
 fn convolve<E>(
     unit: Unit,
     layer: &Layer,
-    from: &Pixels,
+    from: &[Pixels],
     to: &mut Pixels,
     own: &mut Own,
     spread: &impl Spread<E>,
 ) -> Result<(), E> {
-    let [_, height, width] = from.shape;
+    let [_, height, width] = to.shape;
     let size = [height, width];
     let (before, across) = (to.margins[0], to.stride() / to.depth());
     let (to, own) = (to.tiled([layer.band(size), layer.part(size)]), own.cut());

@@ -8,6 +8,7 @@
 //! threads there are.
 
 mod chain;
+mod forms;
 mod layer;
 mod pixels;
 mod product;
