@@ -290,8 +290,17 @@ fn the_doctor_names_every_part() {
     fs::write(&launch, format!("{}[camera.source.mcap]\npath = {:?}\n", bags::SETTINGS, bag)).unwrap();
     let doctor = nightflow(&["doctor", "--config", &launch_text]);
     let said = text(&doctor);
-    for part in ["processor", "runtime", "model", "golden output", "speed", "shared memory", "socket buffers", "camera"]
-    {
+    for part in [
+        "processor",
+        "memory pages",
+        "runtime",
+        "model",
+        "golden output",
+        "speed",
+        "shared memory",
+        "socket buffers",
+        "camera",
+    ] {
         assert!(said.lines().any(|line| line.get(9..).is_some_and(|rest| rest.starts_with(part))), "{part}:\n{said}");
     }
     assert!(said.contains("320×256 bayer_rggb16"), "{said}");

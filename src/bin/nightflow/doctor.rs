@@ -16,6 +16,7 @@ use crate::{
     Exit,
     bench::ours::{self, Ours},
     launch,
+    pages::{self, Pages},
 };
 
 /// A receive buffer below this loses most of a camera's fragments (measured: 93 % of VGA frames at 208 KiB).
@@ -46,7 +47,7 @@ enum Finding {
 /// Prints every check, then how many must be acted upon.
 pub fn run(args: Args) -> Result<Exit> {
     let config = launch::read(args.config.as_deref())?;
-    let mut checks = vec![("processor", processor())];
+    let mut checks = vec![("processor", processor()), ("memory pages", memory_pages())];
     checks.extend(network(&config));
     checks.push(("shared memory", shared_memory(&config)));
     checks.push(("socket buffers", sockets(&config)));
@@ -89,6 +90,14 @@ fn processor() -> Finding {
         return Finding::Warning(format!("{text}none of the vector units that the network is fast with"));
     }
     Finding::Ok(text)
+}
+
+fn memory_pages() -> Finding {
+    Finding::Ok(match pages::found() {
+        Pages::Huge => "huge ones where they fit".into(),
+        Pages::Unasked => format!("small ones; started with {} a running node is faster", pages::SETTING.join("=")),
+        Pages::Small => "small ones: the kernel gives no transparent huge pages".into(),
+    })
 }
 
 /// Runtime library, model files and golden output, and how long one step takes here.
