@@ -75,8 +75,9 @@ impl Transforms<2, 4> for Filter {
     }
 }
 
-/// √2 and its reciprocal are the points: with 1 and 2 in their place, as usual, the results' errors are two and a half times
-/// as large; with these they are a third more than those of nine products one after the other.
+/// √2 and its reciprocal are the points: with 1 and 2 in their place, as usual, the results' errors are twice as large. With these
+/// they are 1.4 times those of products added up one after the other, over 181 inputs, and 0.9 times when sums are short as in
+/// [`super::product`].
 const FAR: f64 = std::f64::consts::SQRT_2;
 const NEAR: f64 = std::f64::consts::FRAC_1_SQRT_2;
 

@@ -74,7 +74,7 @@ impl Layer {
             inputs.extend((0..whole).map(|c| (c < *channels).then_some(end - channels + c)));
             end -= channels;
         }
-        let (weights, prepared) = (weights.into(), [None, None]);
+        let (weights, prepared) = (aligned(weights), [None, None]);
         Self {
             unit,
             inputs,
@@ -205,8 +205,9 @@ impl Work for Prepare<'_> {
     #[inline(always)]
     fn on<L: Lanes>(self, _: L) {
         let Layer { inputs, weights, bias, form, .. } = self.layer;
-        let (read, whole) = (self.layer.inputs(), bias.len());
-        for (o, of_output) in weights.chunks_exact(read * SIZE * SIZE).enumerate() {
+        let (each, whole) = (self.layer.inputs() * SIZE * SIZE, bias.len());
+        let weights = &weights[skipped(weights)..][..self.layer.outputs * each];
+        for (o, of_output) in weights.chunks_exact(each).enumerate() {
             // The panel that the output is in, and where in it.
             let pairs = 2 * L::COUNT;
             let first = o / pairs * pairs;

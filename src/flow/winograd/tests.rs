@@ -119,6 +119,25 @@ fn a_chain_serves_pictures_of_one_size_after_the_other() {
     }
 }
 
+#[test]
+fn weights_that_differ_in_one_number_are_not_shared() {
+    let unit = Unit::best();
+    for (inputs, odd) in [1usize, 2, 30].into_iter().flat_map(|inputs| [0, 9 * inputs - 1].map(|odd| (inputs, odd))) {
+        let given = |value: f32| {
+            let mut weights = vec![0.5; 9 * inputs];
+            weights[odd] = value;
+            let mut layer = Layer::new(unit, &weights, (1, &[inputs]), &[0.0], 1, 1.0);
+            layer.share(crate::flow::onnx_shared::first);
+            let (mut chain, mut given) = (Chain::new(unit, vec![layer], false), vec![0.0; 9]);
+            let Ok(()) = chain.run(&[&vec![1.0; 9 * inputs]], [3, 3], &mut given, None, &backwards);
+            // Keeps the weights in use.
+            (chain, given[4])
+        };
+        let (one, other) = (given(0.5), given(1.5));
+        assert!((other.1 - one.1 - 1.0).abs() < 1e-5, "{inputs} inputs: {}, {}", one.1, other.1);
+    }
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
     #[test]
