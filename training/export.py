@@ -144,23 +144,29 @@ def halved_as_one(values: torch.Tensor) -> torch.Tensor:
 
 
 class EncoderLevels(torch.autograd.Function):
-    """RAFT-small's feature encoder with what is projected from it in bf16, as the node's own operator `nightflow::Encoder`."""
+    """RAFT-small's feature encoder with what is projected from it, of factors of so many bits, as the node's own operator
+    `nightflow::Encoder`."""
 
     @staticmethod
-    def forward(ctx, image, slopes: list[float], *tensors):
+    def forward(ctx, image, settings: dict, slopes: list[float], *tensors):
         rows, columns = image.shape[2:]
         eighth, quarter, projected = (bias.numel() for bias in tensors[-5::2])
         sizes = ((quarter, 4), (eighth, 8), (projected, 8))
         return tuple(image.new_zeros(1, count, rows // part, columns // part) for count, part in sizes)
 
     @staticmethod
-    def symbolic(g, image, slopes: list[float], *tensors):
+    def symbolic(g, image, settings: dict, slopes: list[float], *tensors):
         view = {"factor_f": FACTOR, "offset_f": OFFSET, "shift_i": SHIFT, "slopes_f": slopes}
-        found = g.op(f"{DOMAIN}::Encoder", image, *tensors, outputs=3, **view)
+        found = g.op(f"{DOMAIN}::Encoder", image, *tensors, outputs=3, **settings, **view)
         eighth, quarter, projected = (bias.type().sizes()[0] for bias in tensors[-5::2])
         for value, count in zip(found, (quarter, eighth, projected)):
             value.setType(image.type().with_sizes([1, count, None, None]))
         return tuple(found)
+
+
+def said(bits: int) -> dict[str, int]:
+    """The operators' attribute for so many bits; 16 is what they are of if nothing is said."""
+    return {"bits_i": bits} if bits != 16 else {}
 
 
 def convolutions_of(layers: nn.Module) -> tuple[list[nn.Conv2d], list[float]]:
@@ -178,8 +184,7 @@ def chained(layers: nn.Module, parts: list[torch.Tensor], kept: bool = False, de
     convolutions, slopes = convolutions_of(layers)
     weights = [tensor for convolution in convolutions for tensor in (convolution.weight, convolution.bias)]
     dilations = [convolution.dilation[0] for convolution in convolutions]
-    # 16 and 0 is what they are if nothing is said.
-    settings = ({"bits_i": bits} if bits != 16 else {}) | ({"dense_i": 1} if dense else {})
+    settings = said(bits) | ({"dense_i": 1} if dense else {})
     return Convolutions.apply(settings, len(parts), dilations, slopes, kept, *parts, *weights)
 
 
@@ -200,7 +205,8 @@ def exchanged(parts: list[tuple[nn.Module, str, object]]):
 
 
 def fused(network: PwcNet, bits: int = 32):
-    """Within it the decoder's levels match by the one operator and convolve by the other, and what it resizes it does in one go."""
+    """Within it what looks at one frame and what looks at two are of the node's operators, with factors of so many bits, and what
+    is resized is so in one go."""
     decoder, chain = network.decoder, functools.partial(chained, bits=bits)
     parts = [(decoder, "through", chain), (decoder, "twice", twice_as_one), (decoder, "halved", halved_as_one)]
     for level in (decoder.shared, decoder.fine):
@@ -209,22 +215,14 @@ def fused(network: PwcNet, bits: int = 32):
         )
         layers = lambda parts, level=level: chain(nn.Sequential(level.body, level.predict), parts, kept=True, dense=level.dense)
         parts += [(level, "match", match), (level, "layers", layers)]
-    return exchanged(parts)
-
-
-@contextlib.contextmanager
-def in_bf16(network: PwcNet):
-    """Within it factors are of 16 bits, and what looks at one frame has operators too."""
     pyramid, encoder = network.pyramid, network.pyramid.encoder
     # In the order of use; a unit registers its short cut last, which is where the operator looks for it.
-    parts = (encoder.conv1, encoder.layer1, encoder.layer2, encoder.layer3, encoder.conv2)
-    used = [p for part in parts for p in part.modules() if isinstance(p, nn.Conv2d)]
+    in_turn = (encoder.conv1, encoder.layer1, encoder.layer2, encoder.layer3, encoder.conv2)
+    used = [p for part in in_turn for p in part.modules() if isinstance(p, nn.Conv2d)]
     projections, slopes = convolutions_of(nn.Sequential(pyramid.quarter, pyramid.context))
     weights = [tensor for convolution in used + projections for tensor in (convolution.weight, convolution.bias)]
-    levels = lambda image: EncoderLevels.apply(image, slopes, *weights)
-    own = [(pyramid, "levels", levels), (pyramid, "normalised", Normalised.apply)]
-    with fused(network, bits=16), exchanged(own):
-        yield
+    levels = lambda image: EncoderLevels.apply(image, said(bits), slopes, *weights)
+    return exchanged(parts + [(pyramid, "levels", levels), (pyramid, "normalised", Normalised.apply)])
 
 
 class RaftFrameGraph(nn.Module):
@@ -329,7 +327,7 @@ def traced(
 
 def graphs_of(network: nn.Module, plain: bool = False) -> dict[str, onnx.ModelProto]:
     """`pyramid` and `decoder` graphs of a network in evaluation mode; of a PWC-Net, unless only `plain` ones are wanted, also
-    `fused`, the decoder with the node's own operators in 32 bits, and `pyramid_bf16` and `decoder_bf16`."""
+    both with the node's own operators: in 32 bits `pyramid_fused` and `fused`, and `pyramid_bf16` and `decoder_bf16`."""
     graphs = next(graphs for kind, graphs in GRAPHS.items() if isinstance(network, kind))
     frame, pair = (graph(network).eval() for graph in graphs)
     image = torch.rand(1, 3, GOLDEN_HEIGHT, GOLDEN_WIDTH)
@@ -357,10 +355,9 @@ def graphs_of(network: nn.Module, plain: bool = False) -> dict[str, onnx.ModelPr
     graphs = {"pyramid": pyramid(), "decoder": decoder()}
     if isinstance(network, PwcNet) and not plain:
         own = {DOMAIN: DOMAIN_VERSION}
-        with fused(network):
-            graphs["fused"] = decoder(own)
-        with in_bf16(network):
-            graphs |= {"pyramid_bf16": pyramid(own), "decoder_bf16": decoder(own)}
+        for bits, names in ((32, ("pyramid_fused", "fused")), (16, ("pyramid_bf16", "decoder_bf16"))):
+            with fused(network, bits):
+                graphs |= zip(names, (pyramid(own), decoder(own)))
     return {part: with_half_weights(graph) for part, graph in graphs.items()}
 
 

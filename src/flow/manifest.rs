@@ -28,11 +28,13 @@ pub struct Entry {
     pub pyramid: File,
     /// The graph that finds the flow between two frames' features.
     pub decoder: File,
-    /// The same decoder with the operators of [`crate::flow::cost_volume`], if there is one.
+    /// The same pyramid with the operators of [`crate::flow::convolutions`], if there is one.
+    pub pyramid_fused: Option<File>,
+    /// The same decoder with those and with [`crate::flow::cost_volume`]'s, if there is one.
     pub fused: Option<File>,
-    /// The pyramid with the operators of [`crate::flow::convolutions`], if there is one.
+    /// The pyramid with those operators in bf16, if there is one.
     pub pyramid_bf16: Option<File>,
-    /// The decoder with those and the cost volume's, if there is one.
+    /// The decoder with them, if there is one.
     pub decoder_bf16: Option<File>,
     /// Multiply-adds of all convolutions of a step, pyramid and decoder, at 320 × 256, in 10⁹; they grow with the area.
     pub gigamacs: Option<f64>,

@@ -232,7 +232,7 @@ fn features(entry: &manifest::Entry, pyramid: &Graph, decoder: &Graph) -> Result
     Ok(given)
 }
 
-/// What computes cost volumes and, in bf16, convolutions; the entry's graphs become those for it.
+/// What computes cost volumes and convolutions; the entry's graphs become those for it.
 fn chosen(config: &Config, entry: &mut manifest::Entry) -> Result<Operators, Error> {
     let Config { operators, provider, precision, .. } = *config;
     if provider == Provider::Cpu && precision == Precision::Bf16 {
@@ -262,6 +262,9 @@ fn chosen(config: &Config, entry: &mut manifest::Entry) -> Result<Operators, Err
     Ok(match (operators, entry.fused.take()) {
         (Operators::Fused, Some(fused)) => {
             entry.decoder = fused;
+            if let Some(pyramid) = entry.pyramid_fused.take() {
+                entry.pyramid = pyramid;
+            }
             Operators::Fused
         }
         (Operators::Fused, None) => {

@@ -125,13 +125,15 @@ def test_the_fused_decoder_is_called_alike_and_matches_by_the_one_operator(fresh
     assert reaches == [4, 4, 4, 4] + ([] if network.fast else [2])
 
 
-def test_the_bf16_graphs_are_called_alike_and_convolve_by_their_operators(fresh):
+@pytest.mark.parametrize("bits", [16, 32])
+def test_graphs_of_own_operators_are_called_alike_and_convolve_by_them(fresh, bits):
     network, graphs, _ = fresh
+    names = {16: ("pyramid_bf16", "decoder_bf16"), 32: ("pyramid_fused", "fused")}[bits]
     if not isinstance(network, PwcNet):
-        assert not any("bf16" in part for part in graphs)
+        assert not set(names) & set(graphs)
         return
-    for part in ("pyramid", "decoder"):
-        plain, own = (onnx.load_from_string(graphs[name]) for name in (part, f"{part}_bf16"))
+    for part, name in zip(("pyramid", "decoder"), names):
+        plain, own = (onnx.load_from_string(graphs[name]) for name in (part, name))
         assert plain.graph.input == own.graph.input
         assert [output.name for output in plain.graph.output] == [output.name for output in own.graph.output]
         given = {node.op_type: node for node in own.graph.node if node.domain == "nightflow"}
@@ -141,7 +143,8 @@ def test_the_bf16_graphs_are_called_alike_and_convolve_by_their_operators(fresh)
             # The encoder sees the image as the network does, and two projections are its own.
             assert set(given) == {"Encoder", "Normalised"} and len(given["Encoder"].input) == 1 + 2 * 24
             view = {a.name: onnx.helper.get_attribute_value(a) for a in given["Encoder"].attribute}
-            assert np.allclose(view.pop("slopes"), [1.0, 0.1]) and view == {"factor": 2.0, "offset": -1.0, "shift": 2}
+            assert np.allclose(view.pop("slopes"), [1.0, 0.1]) and view.pop("bits", 16) == bits
+            assert view == {"factor": 2.0, "offset": -1.0, "shift": 2}
             continue
         assert set(given) == {"CostVolume", "Convolutions"}
         of = lambda node, name: next(onnx.helper.get_attribute_value(a) for a in node.attribute if a.name == name)
@@ -165,8 +168,11 @@ def test_the_committed_graphs_are_those_of_their_weights(name):
     network = PwcNet(fast=name.endswith("_fast")).eval()
     network.load_state_dict(checkpoints.of_graphs(MODELS / "pwcnet_fcdn"))
     graphs = graphs_of(network)
-    for part, file in (("decoder", "decoder"), ("fused", "decoder_fused"), ("decoder_bf16", "decoder_bf16")):
-        assert graphs[part].graph == onnx.load(MODELS / f"{name}_{file}.onnx").graph, part
+    named = {"fused": "decoder_fused"}
+    for part in ("decoder", "fused", "decoder_bf16"):
+        assert graphs[part].graph == onnx.load(MODELS / f"{name}_{named.get(part, part)}.onnx").graph, part
+    for part in ("pyramid_fused", "pyramid_bf16"):
+        assert graphs[part].graph == onnx.load(MODELS / f"pwcnet_fcdn_{part}.onnx").graph, part
 
 
 def test_an_untrained_dense_network_comes_with_a_manifest(tmp_path, monkeypatch):
@@ -175,7 +181,7 @@ def test_an_untrained_dense_network_comes_with_a_manifest(tmp_path, monkeypatch)
     manifest = tomllib.loads((tmp_path / "dense" / "manifest.toml").read_text())
     entry = manifest.pop("pwcnet_dense")
     assert not manifest and entry["precisions"] == ["bf16"] and entry["stride"] == STRIDE
-    assert {"pyramid", "decoder", "fused", "pyramid_bf16", "decoder_bf16", "golden"} <= set(entry)
+    assert {"pyramid", "decoder", "pyramid_fused", "fused", "pyramid_bf16", "decoder_bf16", "golden"} <= set(entry)
     assert 0 < max(map(abs, entry["golden"]["flow"])) < 8 and max(entry["golden"]["uncertainty"]) < 8
     assert entry["gigamacs"] == pytest.approx(5.870, abs=1e-3)
     with pytest.raises(SystemExit, match="without a manifest"):
@@ -223,7 +229,7 @@ def test_committed_files_are_those_of_the_manifest(models):
     manifest = tomllib.loads((models / "manifest.toml").read_text())
     assert manifest
     for entry in manifest.values():
-        parts = ("pyramid", "decoder", "fused", "pyramid_bf16", "decoder_bf16")
+        parts = ("pyramid", "decoder", "pyramid_fused", "fused", "pyramid_bf16", "decoder_bf16")
         paths = {part: models / entry[part]["file"] for part in parts if part in entry}
         for part, path in paths.items():
             assert hashlib.sha256(path.read_bytes()).hexdigest() == entry[part]["sha256"]

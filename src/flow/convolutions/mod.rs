@@ -20,7 +20,7 @@ pub(super) mod tests;
 mod tiles;
 
 pub use chain::{Chain, Unfit};
-pub use encoder::{CONVOLUTIONS, Encoder, View, Weights};
+pub use encoder::{CONVOLUTIONS, Encoder, Narrow, View, Weights, Wide};
 pub use layer::{Layer, Step};
 pub use operator::{Convolutions, Encode};
 pub use tiles::Unit;

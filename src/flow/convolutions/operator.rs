@@ -8,7 +8,7 @@ use ort::{
     value::TensorElementType,
 };
 
-use super::{CONVOLUTIONS, Chain, Encoder, Layer, Step, Unit, View, Weights, chain, encoder};
+use super::{CONVOLUTIONS, Chain, Encoder, Layer, Narrow, Step, Unit, View, Weights, Wide, chain, encoder};
 use crate::flow::{
     onnx_shared,
     operators::{input, output, spread},
@@ -46,7 +46,8 @@ pub struct Convolutions;
 
 /// `nightflow::Encoder(image [1, 3, H, W], weight, bias …)`: RAFT-small's feature encoder, convolutions in the order in which
 /// they are used, then two projections of 1 × 1. Attributes: how the image is seen, by `factor`, `offset` and an even `shift`, as it
-/// is where they are missing; and `slopes`, what the projections multiply negative results with, 1 where they are missing.
+/// is where they are missing; `slopes`, what the projections multiply negative results with, 1 where they are missing; and of how
+/// many `bits` the factors are, 16 (bf16) or 32.
 /// Outputs: what is projected from the second layer's, what the last convolution gives, and what is projected from that.
 pub struct Encode;
 
@@ -64,7 +65,13 @@ enum Work {
 
 /// A node of a graph.
 pub struct EncoderNode {
-    work: Encoder,
+    work: Encoding,
+}
+
+/// By the bits of the factors.
+enum Encoding {
+    Sixteen(Box<Encoder<Narrow>>),
+    ThirtyTwo(Box<Encoder<Wide>>),
 }
 
 /// An input that does not change, and its shape.
@@ -255,7 +262,13 @@ impl Operator for Encode {
         let shift = usize::try_from(shift).ok().filter(|shift| shift.is_multiple_of(2));
         let shift = shift.ok_or_else(|| Error::new(format!("{ENCODER}: shift should be an even number of pixels")))?;
         let (factor, offset) = (attributes.get("factor").unwrap_or(1.0), attributes.get("offset").unwrap_or(0.0));
-        Ok(EncoderNode { work: Encoder::new(Unit::best(), View { factor, offset, shift }, &weights)? })
+        let view = View { factor, offset, shift };
+        let work = match attributes.get::<i64>("bits").unwrap_or(16) {
+            16 => Encoding::Sixteen(Box::new(Encoder::new(Unit::best(), view, &weights)?)),
+            32 => Encoding::ThirtyTwo(Box::new(Encoder::new(winograd::Unit::best(), view, &weights)?)),
+            bits => return Err(Error::new(format!("{ENCODER}: bits should be 16 or 32, they are {bits}"))),
+        };
+        Ok(EncoderNode { work })
     }
 }
 
@@ -264,7 +277,10 @@ impl Kernel for EncoderNode {
         let (image, lengths) = input(context, ENCODER, 0)?;
         let wrong = || Error::new(format!("{ENCODER}: image should be [1, 3, H, W], it is {lengths:?}"));
         let [height, width] = size(lengths).ok_or_else(wrong)?;
-        let channels = self.work.outputs();
+        let channels = match &self.work {
+            Encoding::Sixteen(encoder) => encoder.outputs(),
+            Encoding::ThirtyTwo(encoder) => encoder.outputs(),
+        };
         let of = |channels: usize, part: usize| [1, channels, height / part, width / part].map(|length| length as i64);
         let quarter = output(context, 0, of(channels[0], 4))?;
         let eighth = output(context, 1, of(channels[1], 8))?;
@@ -272,6 +288,10 @@ impl Kernel for EncoderNode {
         let spread = |count: usize, work: &(dyn Fn(usize) + Sync)| {
             shared(context, height * width >= CELLS_SPREAD_MIN, count, work)
         };
-        self.work.run(image, [height, width], [quarter, eighth, projected], &spread)
+        let to = [quarter, eighth, projected];
+        match &mut self.work {
+            Encoding::Sixteen(encoder) => encoder.run(image, [height, width], to, &spread),
+            Encoding::ThirtyTwo(encoder) => encoder.run(image, [height, width], to, &spread),
+        }
     }
 }

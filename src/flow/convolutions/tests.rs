@@ -6,11 +6,11 @@ use proptest::prelude::*;
 use rayon::prelude::*;
 
 use super::{
-    encoder::Unfit,
+    encoder::{Numbers, Unfit},
     tiles::{narrowed, widened},
     *,
 };
-use crate::flow::cost_volume::tests::noise;
+use crate::flow::{cost_volume::tests::noise, winograd};
 
 impl From<Unfit> for Infallible {
     fn from(unfit: Unfit) -> Self {
@@ -22,6 +22,14 @@ impl From<chain::Unfit> for Infallible {
     fn from(unfit: chain::Unfit) -> Self {
         panic!("{unfit}")
     }
+}
+
+/// How numbers are rounded.
+type Round = fn(f64) -> f64;
+
+/// As bf16 has them.
+fn to_bf16(value: f64) -> f64 {
+    f64::from(widened(narrowed(value as f32)))
 }
 
 /// Planes of f64.
@@ -38,18 +46,18 @@ impl Planes {
         if inside { self.values[(c * height + y as usize) * width + x as usize] } else { 0.0 }
     }
 
-    /// As bf16 has them.
-    fn rounded(mut self) -> Self {
-        self.values.iter_mut().for_each(|value| *value = f64::from(widened(narrowed(*value as f32))));
+    fn rounded(mut self, round: Round) -> Self {
+        self.values.iter_mut().for_each(|value| *value = round(*value));
         self
     }
 
+    /// By weights that are rounded.
     fn convolved(
         &self,
         weights: &[f32],
         [outputs, inputs, rows, columns]: [usize; 4],
         bias: &[f32],
-        step: Step,
+        (step, round): (Step, Round),
     ) -> Self {
         let [channels, height, width] = self.shape;
         assert_eq!(channels, inputs);
@@ -64,8 +72,8 @@ impl Planes {
                         start as isize + (tap as isize - (length / 2) as isize) * step.dilation as isize
                     };
                     let (from_y, from_x) = (at(y * down, tap / columns, rows), at(x * right, tap % columns, columns));
-                    let weight = widened(narrowed(weights[(o * inputs + i) * rows * columns + tap]));
-                    sum += f64::from(weight) * self.at(i, from_y, from_x);
+                    let weight = round(f64::from(weights[(o * inputs + i) * rows * columns + tap]));
+                    sum += weight * self.at(i, from_y, from_x);
                 }
                 values.push(if sum < 0.0 { f64::from(step.slope) * sum } else { sum });
             }
@@ -74,13 +82,12 @@ impl Planes {
     }
 
     /// By the mean and the deviation before they are rounded.
-    fn normalised(mut self) -> Self {
+    fn normalised(mut self, round: Round) -> Self {
         let cells = self.shape[1] * self.shape[2];
         for plane in self.values.chunks_exact_mut(cells) {
             let mean = plane.iter().sum::<f64>() / cells as f64;
             let variance = plane.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / cells as f64;
-            let rounded = |v: f64| f64::from(widened(narrowed(v as f32)));
-            plane.iter_mut().for_each(|v| *v = (rounded(*v) - mean) / (variance + 1e-5).sqrt());
+            plane.iter_mut().for_each(|v| *v = (round(*v) - mean) / (variance + 1e-5).sqrt());
         }
         self
     }
@@ -134,8 +141,8 @@ fn chain_is_as_defined(sizes: [usize; 2], widths: &[usize], dilations: &[usize],
             from.values = wanted.iter().flat_map(|planes| &planes.values).copied().collect();
             from.shape[0] = shape(i)[1];
         }
-        let from = from.rounded();
-        wanted.push(from.convolved(&weights[i], shape(i), &bias[i], steps[i]));
+        let from = from.rounded(to_bf16);
+        wanted.push(from.convolved(&weights[i], shape(i), &bias[i], (steps[i], to_bf16)));
     }
     let parts: Vec<&[f32]> = if widths[0] > 2 {
         let (one, rest) = image.split_at(2 * cells);
@@ -224,6 +231,12 @@ fn slices(planes: &mut [Vec<f32>; 3]) -> [&mut [f32]; 3] {
 
 #[test]
 fn the_encoder_is_raft_smalls() {
+    encoder_is_raft_smalls::<Narrow>(&Unit::all(), to_bf16, [0.01, 0.02, 0.02]);
+    encoder_is_raft_smalls::<Wide>(&winograd::Unit::all(), |value| value, [1e-5; 3]);
+}
+
+/// Within these parts of what it should be.
+fn encoder_is_raft_smalls<N: Numbers>(units: &[N::Unit], round: Round, allowed: [f64; 3]) {
     let shapes = shapes(32, [32, 64, 96], 40);
     assert_eq!(shapes.len(), CONVOLUTIONS);
     let values: Vec<Vec<f32>> =
@@ -232,7 +245,7 @@ fn the_encoder_is_raft_smalls() {
     let weights: Vec<Weights<'_>> = (0..shapes.len())
         .map(|i| Weights { values: &values[i], shape: shapes[i], bias: &bias[i], slope: slope(i) })
         .collect();
-    let (height, width) = (48, 40);
+    let (height, width) = (48, 56);
     // Waves, so that norms have something to do.
     let image: Vec<f32> = (0..3 * height * width)
         .map(|i| ((i % width) as f32 * 0.3 + (i / width) as f32 * 0.11).sin() * 0.6 + 0.1 * noise(i as u64, 1)[0])
@@ -242,7 +255,7 @@ fn the_encoder_is_raft_smalls() {
         let step = Step { stride: [stride; 2], dilation: 1, slope: slope(number) };
         let bias = if biased { &bias[number][..] } else { &[] };
         number += 1;
-        from.convolved(&values[number - 1], shapes[number - 1], bias, step)
+        from.convolved(&values[number - 1], shapes[number - 1], bias, (step, round))
     };
     let view = View { factor: 1.5, offset: -0.25, shift: 2 };
     let seen = |i: usize| {
@@ -250,19 +263,20 @@ fn the_encoder_is_raft_smalls() {
         let inside = y < height && x < width;
         if inside { f64::from(view.factor * image[(c * height + y) * width + x] + view.offset) } else { 0.0 }
     };
-    let image_planes = Planes { values: (0..image.len()).map(seen).collect(), shape: [3, height, width] }.rounded();
-    let smooth = |planes: Planes| planes.normalised().positive().rounded();
+    let image_planes =
+        Planes { values: (0..image.len()).map(seen).collect(), shape: [3, height, width] }.rounded(round);
+    let smooth = |planes: Planes| planes.normalised(round).positive().rounded(round);
     let mut x = smooth(convolve(&image_planes, 2, false));
     let mut quarter = None;
     for (layer, stride) in [1, 2, 2].into_iter().enumerate() {
         for stride in [stride, 1] {
             let y = smooth(convolve(&x, 1, false));
             let y = smooth(convolve(&y, stride, false));
-            let y = convolve(&y, 1, false).normalised().positive();
-            let short = if stride > 1 { convolve(&x, stride, false).normalised() } else { x.clone() };
+            let y = convolve(&y, 1, false).normalised(round).positive();
+            let short = if stride > 1 { convolve(&x, stride, false).normalised(round) } else { x.clone() };
             let mut sum = y;
             sum.values.iter_mut().zip(&short.values).for_each(|(a, b)| *a += b);
-            x = sum.positive().rounded();
+            x = sum.positive().rounded(round);
         }
         if layer == 1 {
             quarter = Some(x.clone());
@@ -270,11 +284,12 @@ fn the_encoder_is_raft_smalls() {
     }
     let eighth = convolve(&x, 1, true);
     let quarter = convolve(&quarter.unwrap(), 1, true);
-    let projected = convolve(&eighth.clone().rounded(), 1, true);
-    for unit in Unit::all() {
-        let mut encoder = Encoder::new(unit, view, &weights).unwrap();
+    let projected = convolve(&eighth.clone().rounded(round), 1, true);
+    for &unit in units {
+        let mut encoder = Encoder::<N>::new(unit, view, &weights).unwrap();
         assert_eq!(encoder.outputs(), [20, 40, 9]);
-        let mut found = [vec![f32::NAN; 20 * 12 * 10], vec![f32::NAN; 40 * 6 * 5], vec![f32::NAN; 9 * 6 * 5]];
+        let mut found =
+            [(20, 4), (40, 8), (9, 8)].map(|(channels, part)| vec![f32::NAN; channels * height * width / part / part]);
         let mut again = found.clone();
         let Ok(()) = encoder.run::<Infallible>(&image, [height, width], slices(&mut found), &backwards);
         let Ok(()) = encoder.run::<Infallible>(&image, [height, width], slices(&mut again), &shared);
@@ -285,7 +300,7 @@ fn the_encoder_is_raft_smalls() {
         let Ok(()) = encoder.run::<Infallible>(&wider, [64, 96], slices(&mut of_wider), &shared);
         let Ok(()) = encoder.run::<Infallible>(&image, [height, width], slices(&mut again), &backwards);
         assert_eq!(found, again);
-        for (found, (wanted, allowed)) in found.iter().zip([(&quarter, 0.01), (&eighth, 0.02), (&projected, 0.02)]) {
+        for ((found, wanted), allowed) in found.iter().zip([&quarter, &eighth, &projected]).zip(allowed) {
             let error = apart(found, &wanted.values);
             assert!(error < allowed, "{unit:?}: {error}");
         }
@@ -301,11 +316,11 @@ fn weights_of_another_network_are_refused() {
     let weights: Vec<Weights<'_>> = (0..shapes.len())
         .map(|i| Weights { values: &values[i], shape: shapes[i], bias: &bias[..shapes[i][0]], slope: 1.0 })
         .collect();
-    let error = Encoder::new(Unit::Plain, View::WHOLE, &weights).unwrap_err().to_string();
+    let error = Encoder::<Narrow>::new(Unit::Plain, View::WHOLE, &weights).unwrap_err().to_string();
     assert_eq!(
         error,
         "the encoder's convolution 3 should have 1 × 1 weights of Some(8) inputs and a bias for each output, it has [32, 9, 1, 1]"
     );
-    let error = Encoder::new(Unit::Plain, View::WHOLE, &weights[..2]).unwrap_err().to_string();
+    let error = Encoder::<Narrow>::new(Unit::Plain, View::WHOLE, &weights[..2]).unwrap_err().to_string();
     assert!(error.contains("the encoder's convolution"), "{error}");
 }

@@ -9,6 +9,8 @@
 //!   gradients are not correlated with the difference of the frames, so that noise does not pull to whole or half pixels.
 //! - A pixel's weight is the inverse of its noise variance, which the exposure stage measured; what noise adds to the
 //!   gradients' products is taken off. Where frames differ by more than noise, the information is divided by as much.
+//!   It is also multiplied with the probability that the truth is within a reach of two pixels, by the error that the network
+//!   expects: in mere noise gradients know nothing.
 //! - The products are summed over windows of ever larger size. What the larger window says is what the smaller one
 //!   believes beforehand: flat cells and dark ones take the correction of what lies around them, at most that, and the
 //!   largest window believes the network. Errors of a network are alike over many cells, and many cells know what one

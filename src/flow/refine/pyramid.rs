@@ -12,6 +12,8 @@ const LOCAL: f32 = 1.0;
 const COLUMN: [f32; 5] = [1.0, 56.0 / 70.0, 28.0 / 70.0, 8.0 / 70.0, 1.0 / 70.0];
 /// No correction is longer, pixels: the gradients know no further.
 const REACH: f32 = 1.0;
+/// Errors of vectors, pixels on either axis, of which gradients still know something: texture is a few pixels wide.
+const NEAR: f32 = 2.0;
 /// A variance that stands for knowing nothing, pixels².
 const UNKNOWN: f32 = 1e3;
 
@@ -238,9 +240,13 @@ fn settle(
 
 /// Mean and half of the covariance's trace, where the window's correction is known beforehand to be `before` with the
 /// inverse variance `belief`, and `before` itself has the variance `unsure`.
+///
+/// Gradients are believed as far as the truth is likely to be near. Where the network states an error of many pixels, as in mere
+/// noise, what they say is chance, and makes much of the last digits of the vectors.
 fn posterior(sum: &[f32; Sums::PLANES], before: [f32; 2], unsure: f32, belief: f32) -> Known {
+    let near = 1.0 - (-0.5 * NEAR * NEAR * belief).exp();
     // More difference than noise lets expect: moving things, light that changed, motion that is none. It weighs on all.
-    let trust = 1.0 / (sum[MISFIT] / sum[COUNT]).max(1.0);
+    let trust = near / (sum[MISFIT] / sum[COUNT]).max(1.0);
     let (middle, lean, skew) = (0.5 * (sum[XX] + sum[YY]), 0.5 * (sum[XX] - sum[YY]), sum[XY]);
     let apart = (lean * lean + skew * skew).sqrt();
     // The direction that is known best, by half its angle.

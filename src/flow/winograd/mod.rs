@@ -10,7 +10,7 @@
 mod chain;
 mod forms;
 mod layer;
-mod pixels;
+pub(super) mod pixels;
 mod product;
 #[cfg(test)]
 mod tests;
