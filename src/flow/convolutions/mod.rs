@@ -1,8 +1,8 @@
 //! The operators `nightflow::Convolutions` and `nightflow::Encoder`: convolutions in bf16 by the processor's matrix tiles or dot
-//! products, and (by [`super::winograd`]) in 32 bits.
+//! products, and in 32 bits: chains by [`super::winograd`], the encoder's as they are defined.
 //!
 //! Pixels lie with their channels side by side ([`map`]), so that a tile of 16 pixels is read as it is, for every weight from
-//! another place ([`layer`]): no copy of the picture is made for the multiplication's sake. Products are of bf16, sums of 32
+//! another place ([`layer`]): no copy of the picture is made for the multiplication's sake. Products of bf16 have sums of 32
 //! bits. [`chain`] runs convolutions one after the other, [`encoder`] the network's feature encoder with its norms; what goes
 //! in and comes out are planes of f32, as ONNX has them. Every result is computed by one thread in a fixed order, so that it
 //! does not depend on how many threads there are.

@@ -95,8 +95,6 @@ pub struct Mistake(String);
 
 /// Sizes that costs are followed over, in halves of the size that was asked for.
 const HALVES: [usize; 4] = [1, 2, 4, 8];
-/// Steps of a size before the one that is timed.
-const LEAD: usize = 4;
 
 /// Measures, prints the tables and writes them where that is asked for.
 pub fn run(args: &Args) -> Result<Exit> {
@@ -270,8 +268,7 @@ impl<'a> Bench<'a> {
         Ok(())
     }
 
-    /// One network from half the size to four times it, with one thread and with as many as were asked for. A camera's frames are of one
-    /// size, so that the first [`LEAD`] steps after those of other sizes, which had the caches in between, are not timed.
+    /// One network from half the size to four times it, with one thread and with as many as were asked for.
     fn growth(&self, report: &mut Report) -> Result<()> {
         // The largest takes sixteen times as long.
         let rounds = usize::from(self.args.rounds).div_ceil(3);
@@ -283,9 +280,7 @@ impl<'a> Bench<'a> {
             let frames = ours::frames(size[0], size[1]);
             for &threads in &threads {
                 let config = self.config(&self.followed, self.operators(&self.followed), threads);
-                let Turn { what, mut step } = enter(What::Sized(size, threads), &config, &frames, report)?;
-                let stream = move || (0..LEAD).try_for_each(|_| step().map(drop)).and_then(|()| step());
-                turns.push(Turn { what, step: Box::new(stream) });
+                turns.push(enter(What::Sized(size, threads), &config, &frames, report)?);
                 report.sizes.push((size, threads));
             }
         }

@@ -8,7 +8,7 @@ use super::{
     errors::Errors,
     ours::{Product, padded},
     rival::{BITS, METHODS},
-    turns::{Found, Times, What},
+    turns::{Found, LEAD, Times, What},
 };
 
 /// What the fused operators are to reach against plain ones.
@@ -105,11 +105,12 @@ impl Report {
         beside.for_each(|line| _ = writeln!(text, "- {line}"));
         let _ = writeln!(
             text,
-            "- images of {}, threads: {}, rounds: {}\n\nWhat a section compares ran in turns. Milliseconds are medians, in brackets \
-             the best; ratios are medians of the ratios within a round.",
+            "- images of {}, threads: {}, rounds: {}\n\nWhat a section compares ran in turns, of a turn's {} steps the last was timed, as in a \
+             stream. Milliseconds are medians, in brackets the best; ratios are medians of the ratios within a round.",
             size(self.size),
             self.threads,
-            self.rounds
+            self.rounds,
+            LEAD + 1
         );
         self.step(&mut text);
         if let Some(beside) = &self.rivals {
