@@ -11,7 +11,7 @@ mod chain;
 mod forms;
 mod layer;
 pub(super) mod pixels;
-mod product;
+pub(super) mod product;
 #[cfg(test)]
 mod tests;
 

@@ -3,10 +3,15 @@
 use super::pixels::LINE;
 use crate::flow::lanes::{Lanes, Work, fetch};
 
-/// Tiles that are multiplied at once with two vectors of weights: so many sums as fit the registers, of which AVX-512 and NEON
+/// Tiles or pixels that are multiplied at once with two vectors of weights: so many sums as fit the registers, of which AVX-512 and NEON
 /// have 32 and AVX2 has 16.
-const MANY: usize = 8;
+pub const MANY: usize = 8;
 const FEW: usize = 6;
+
+/// One of the two.
+pub fn most<L: Lanes>() -> usize {
+    if L::COUNT == 8 { FEW } else { MANY }
+}
 
 /// Lines of channels whose products are summed up before they are added to those before: one long sum loses more digits, and
 /// tiles of 4 × 4 have none to lose.
@@ -39,7 +44,7 @@ pub fn panel<L: Lanes>(outputs: usize, first: usize) -> usize {
 /// Adds the sums over those inputs to those over the ones before, `to` having a row of `outputs` values (a multiple of [`LINE`]) for each tile.
 #[inline(always)]
 pub fn multiply<L: Lanes>(lanes: L, factors: Factors<'_>, to: &mut [f32], outputs: usize) {
-    let (most, [begin, end]) = (if L::COUNT == 8 { FEW } else { MANY }, factors.some);
+    let (most, [begin, end]) = (most::<L>(), factors.some);
     let (mut first, mut weights) = (0, factors.weights);
     let blocks = factors.count.div_ceil(most);
     while first < outputs {

@@ -5,13 +5,12 @@ use crate::flow::{
     bands::{Band, Bands},
     convolutions::{Spread, layer::Step},
     lanes::{Lanes, TILE, Unit, Work},
-    winograd::pixels::{LINE, Pixels},
+    winograd::{
+        pixels::{LINE, Pixels},
+        product::{MANY, most, panel},
+    },
 };
 
-/// Pixels that are computed at once with two vectors of weights: so many sums as fit the registers, of which AVX-512 and NEON
-/// have 32 and AVX2 has 16.
-const MANY: usize = 8;
-const FEW: usize = 6;
 /// The most outputs that are computed at once: two vectors of 16.
 const WIDE: usize = 2 * LINE;
 /// About how many bands a picture is cut into.
@@ -114,11 +113,6 @@ impl Layer {
     }
 }
 
-/// Vectors of a panel that begins with this output.
-fn panel<L: Lanes>(outputs: usize, first: usize) -> usize {
-    if outputs - first >= 2 * L::COUNT { 2 } else { 1 }
-}
-
 /// Weights in the order in which they are used.
 struct Prepare<'a> {
     weights: &'a [f32],
@@ -162,7 +156,7 @@ impl Work for Convolve<'_> {
     #[inline(always)]
     fn on<L: Lanes>(mut self, lanes: L) {
         let Layer { inputs, size: [rows, columns], ref weights, ref bias, .. } = *self.layer;
-        let most = if L::COUNT == 8 { FEW } else { MANY };
+        let most = most::<L>();
         for y in self.rows[0]..self.rows[1] {
             if let Some(sums) = &mut self.sums {
                 sums.row(0, y).fill(0.0);

@@ -95,10 +95,11 @@ pub trait Numbers {
     /// The image as the first one reads it.
     type Image: Default + fmt::Debug;
 
+    /// Of how many columns of [`Numbers::Image`] the first convolution has an output.
+    const FIRST_ACROSS: usize;
+
     /// A convolution, of outputs × inputs × rows × columns weights and a bias for each output or none.
     fn layer(unit: Self::Unit, weights: &[f32], shape: [usize; 4], bias: &[f32], step: Step) -> Self::Layer;
-    /// The first one, of outputs × [`COLOURS`] × [`FIRST`] × [`FIRST`] weights, which halves the image.
-    fn first(unit: Self::Unit, weights: &[f32], outputs: usize) -> Self::Layer;
     /// Channels that come out.
     fn outputs(layer: &Self::Layer) -> usize;
     /// Rows and columns of zeros that its map must have around it.
@@ -143,6 +144,17 @@ pub trait Numbers {
         to: &mut Self::Image,
         spread: &impl Spread<E>,
     ) -> Result<(), E>;
+}
+
+/// The first convolution's weights for images whose colours lie side by side, and so all that it reads of a row: each column's colours
+/// are inputs.
+fn side_by_side(weights: &[f32]) -> Vec<f32> {
+    let mut turned = vec![0.0; weights.len()];
+    for (i, value) in weights.iter().enumerate() {
+        let [o, c, y, x] = [i / (COLOURS * FIRST * FIRST), i / (FIRST * FIRST) % COLOURS, i / FIRST % FIRST, i % FIRST];
+        turned[(o * COLOURS * FIRST + x * COLOURS + c) * FIRST + y] = *value;
+    }
+    turned
 }
 
 /// Norms are for multiples of so many channels.
@@ -321,7 +333,9 @@ impl<N: Numbers> Encoder<N> {
         };
         let (image, ..) = take(Some(COLOURS), FIRST, 2, false)?;
         let outputs = image.shape[0];
-        let first = Normed::new(N::first(unit, image.values, outputs));
+        let step = Step { stride: [2, N::FIRST_ACROSS], dilation: 1, slope: 1.0 };
+        let shape = [outputs, COLOURS * FIRST, FIRST, 1];
+        let first = Normed::new(N::layer(unit, &side_by_side(image.values), shape, &[], step));
         let (mut units, mut width, mut quarter) = (vec![], outputs, outputs);
         for stride in STRIDES {
             for stride in [stride, 1] {

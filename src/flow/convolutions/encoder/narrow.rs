@@ -33,19 +33,11 @@ impl Numbers for Narrow {
     type Map = Map;
     type Image = Image;
 
+    // Its image has a pixel for every second column.
+    const FIRST_ACROSS: usize = 1;
+
     fn layer(_: Unit, weights: &[f32], shape: [usize; 4], bias: &[f32], step: Step) -> Layer {
         Layer::new(weights, shape, bias, step)
-    }
-
-    fn first(_: Unit, weights: &[f32], outputs: usize) -> Layer {
-        let mut turned = vec![0.0; weights.len()];
-        for (i, value) in weights.iter().enumerate() {
-            let [o, c, y, x] =
-                [i / (COLOURS * FIRST * FIRST), i / (FIRST * FIRST) % COLOURS, i / FIRST % FIRST, i % FIRST];
-            turned[(o * COLOURS * FIRST + x * COLOURS + c) * FIRST + y] = *value;
-        }
-        let step = Step { stride: [2, 1], dilation: 1, slope: 1.0 };
-        Layer::new(&turned, [outputs, COLOURS * FIRST, FIRST, 1], &[], step)
     }
 
     fn outputs(layer: &Layer) -> usize {

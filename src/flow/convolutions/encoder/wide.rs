@@ -38,19 +38,10 @@ impl Numbers for Wide {
     type Map = Pixels;
     type Image = Image;
 
+    const FIRST_ACROSS: usize = 2;
+
     fn layer(unit: Unit, weights: &[f32], shape: [usize; 4], bias: &[f32], step: Step) -> Layer {
         Layer::new(unit, weights, shape, bias, step)
-    }
-
-    fn first(unit: Unit, weights: &[f32], outputs: usize) -> Layer {
-        let mut turned = vec![0.0; weights.len()];
-        for (i, value) in weights.iter().enumerate() {
-            let [o, c, y, x] =
-                [i / (COLOURS * FIRST * FIRST), i / (FIRST * FIRST) % COLOURS, i / FIRST % FIRST, i % FIRST];
-            turned[(o * COLOURS * FIRST + x * COLOURS + c) * FIRST + y] = *value;
-        }
-        let step = Step { stride: [2; 2], dilation: 1, slope: 1.0 };
-        Layer::new(unit, &turned, [outputs, COLOURS * FIRST, FIRST, 1], &[], step)
     }
 
     fn outputs(layer: &Layer) -> usize {
