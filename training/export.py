@@ -18,7 +18,7 @@ from torch import nn
 
 import checkpoints
 from flownet import KINDS, FlowNet
-from networks import FACTOR, GAIN, OFFSET, SHIFT, STRIDE, LevelDecoder, PwcNet
+from networks import FACTOR, FLOW_GAIN, GAIN, OFFSET, SHIFT, STRIDE, PwcNet, doubled, halved, twice
 from raft import RaftSmall
 
 OPSET = 17
@@ -71,15 +71,30 @@ class CostVolume(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, older, newer, flow, sharpness, reach: int):
-        return older.new_zeros(1, (2 * reach + 1) ** 2, *older.shape[2:]), torch.zeros_like(flow)
+        volume = older.new_zeros(1, (2 * reach + 1) ** 2, *older.shape[2:])
+        return volume, torch.zeros_like(flow), torch.zeros_like(flow)
 
     @staticmethod
     def symbolic(g, older, newer, flow, sharpness, reach: int):
         inputs = (older, newer, flow, sharpness)
-        volume, argmax = g.op(f"{DOMAIN}::CostVolume", *inputs, reach_i=reach, gain_f=GAIN, outputs=2)
-        volume.setType(older.type().with_sizes([1, (2 * reach + 1) ** 2, None, None]))
-        argmax.setType(flow.type().with_sizes([1, 2, None, None]))
-        return volume, argmax
+        found = g.op(f"{DOMAIN}::CostVolume", *inputs, reach_i=reach, gain_f=GAIN, part_f=FLOW_GAIN, outputs=3)
+        for value, channels in zip(found, ((2 * reach + 1) ** 2, 2, 2)):
+            value.setType(older.type().with_sizes([1, channels, None, None]))
+        return tuple(found)
+
+
+class Moved(torch.autograd.Function):
+    """`networks.LevelDecoder.moved` as the node's own operator `nightflow::Moved`."""
+
+    @staticmethod
+    def forward(ctx, flow, predicted, argmax):
+        return torch.zeros_like(flow)
+
+    @staticmethod
+    def symbolic(g, flow, predicted, argmax):
+        found = g.op(f"{DOMAIN}::Moved", flow, predicted, argmax)
+        found.setType(flow.type())
+        return found
 
 
 class Convolutions(torch.autograd.Function):
@@ -117,30 +132,32 @@ class Normalised(torch.autograd.Function):
 
 
 class Resized(torch.autograd.Function):
-    """A bilinear resize by a rule about where cells lie that PyTorch does not have, or does not export as one operator."""
+    """`networks.resized` as the node's own operator `nightflow::Resized`."""
+
+    # By the rule how it is called there, and what length a length becomes.
+    RULES = {
+        halved: ("halved", lambda length: length // 2),
+        doubled: ("doubled", lambda length: 2 * length),
+        twice: ("between", lambda length: 2 * length),
+    }
 
     @staticmethod
-    def forward(ctx, values, channels: int, by: float, rule: str):
-        rows, columns = (2 * length if by > 1 else length // 2 for length in values.shape[2:])
-        return values.new_zeros(1, channels, rows, columns)
+    def forward(ctx, rule, channels: list[int], gains: list[float], *values):
+        become = Resized.RULES[rule][1]
+        return tuple(value.new_zeros(1, count, *map(become, value.shape[2:])) for value, count in zip(values, channels))
 
     @staticmethod
-    def symbolic(g, values, channels: int, by: float, rule: str):
-        nowhere = g.op("Constant", value_t=torch.tensor([], dtype=torch.float32))
-        scales = g.op("Constant", value_t=torch.tensor([1.0, 1.0, by, by]))
-        found = g.op("Resize", values, nowhere, scales, coordinate_transformation_mode_s=rule, mode_s="linear")
-        found.setType(values.type().with_sizes([1, channels, None, None]))
-        return found
+    def symbolic(g, rule, channels: list[int], gains: list[float], *values):
+        found = g.op(f"{DOMAIN}::Resized", *values, rule_s=Resized.RULES[rule][0], gains_f=gains, outputs=len(values))
+        found = [found] if len(values) == 1 else found
+        for to, value, count in zip(found, values, channels):
+            to.setType(value.type().with_sizes([1, count, None, None]))
+        return tuple(found)
 
 
-def twice_as_one(values: torch.Tensor) -> torch.Tensor:
-    """`networks.twice`: asymmetric is that every second cell is one of before, and those beyond the last are like the last."""
-    return Resized.apply(values, int(values.shape[1]), 2.0, "asymmetric")
-
-
-def halved_as_one(values: torch.Tensor) -> torch.Tensor:
-    """`networks.halved`: half of the pixels, each between four of before. A pooling would have ONNX Runtime reorder the channels."""
-    return Resized.apply(values, int(values.shape[1]), 0.5, "half_pixel")
+def resized_as_one(rule, *values: torch.Tensor, gains: tuple[float, ...] | None = None) -> tuple[torch.Tensor, ...]:
+    """What `networks.resized` gives, by the one operator."""
+    return Resized.apply(rule, [int(value.shape[1]) for value in values], list(gains or [1.0] * len(values)), *values)
 
 
 class EncoderLevels(torch.autograd.Function):
@@ -205,16 +222,15 @@ def exchanged(parts: list[tuple[nn.Module, str, object]]):
 
 
 def fused(network: PwcNet, bits: int = 32):
-    """Within it what looks at one frame and what looks at two are of the node's operators, with factors of so many bits, and what
-    is resized is so in one go."""
+    """Within it what looks at one frame and what looks at two are of the node's operators, with factors of so many bits."""
     decoder, chain = network.decoder, functools.partial(chained, bits=bits)
-    parts = [(decoder, "through", chain), (decoder, "twice", twice_as_one), (decoder, "halved", halved_as_one)]
+    parts = [(decoder, "through", chain), (decoder, "resized", resized_as_one)]
     for level in (decoder.shared, decoder.fine):
         match = lambda older, newer, flow, tile, fetch, level=level: CostVolume.apply(
             older, newer, flow, level.sharpness, level.reach
         )
         layers = lambda parts, level=level: chain(nn.Sequential(level.body, level.predict), parts, kept=True, dense=level.dense)
-        parts += [(level, "match", match), (level, "layers", layers)]
+        parts += [(level, "match", match), (level, "layers", layers), (level, "moved", Moved.apply)]
     pyramid, encoder = network.pyramid, network.pyramid.encoder
     # In the order of use; a unit registers its short cut last, which is where the operator looks for it.
     in_turn = (encoder.conv1, encoder.layer1, encoder.layer2, encoder.layer3, encoder.conv2)

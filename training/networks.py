@@ -32,6 +32,8 @@ CONTEXT = ((64, 1), (64, 2), (64, 4), (64, 8), (32, 1))
 REACH, NARROW_REACH = 4, 2
 # The cost volume is a mean of products of unit deviation; the convolutions want it larger.
 GAIN = 4.0
+# Flow is of the size of a cost volume's reach, and larger at large motion only.
+FLOW_GAIN = 0.25
 # Inputs are multiples of this in both directions: the coarsest level has whole cells.
 STRIDE = 2**COARSEST
 # Columns a tile of the cost volume has. They divide the levels' widths where an input is a multiple of 64 wide; elsewhere a
@@ -139,6 +141,18 @@ def twice(values: torch.Tensor) -> torch.Tensor:
     return values
 
 
+def doubled(values: torch.Tensor) -> torch.Tensor:
+    """Bilinear: a cell becomes four, each with a quarter of its area."""
+    return F.interpolate(values, scale_factor=2, mode="bilinear", align_corners=False)
+
+
+def resized(rule, *values: torch.Tensor, gains: tuple[float, ...] | None = None) -> tuple[torch.Tensor, ...]:
+    """Each of the values by a rule (`halved`, `doubled` or `twice`), then multiplied with its gain, if there are any. One operator
+    in the fused graphs of export.py."""
+    found = tuple(rule(value) for value in values)
+    return tuple(gain * value if gain != 1 else value for gain, value in zip(gains or [1] * len(found), found))
+
+
 class Pyramid(nn.Module):
     """Image [B, 3, H, W] (linear RGB, mean about 0.4) to what is to be known of one frame: features to match at level 2
     [B, 32, H/4, W/4] and 3 [B, 128, H/8, W/8], and context at level 3 [B, 64, H/8, W/8]."""
@@ -184,12 +198,13 @@ class LevelDecoder(nn.Module):
         self.register_buffer("offsets", torch.stack([dx.flatten(), dy.flatten()]), persistent=False)
 
     def match(self, older, newer, flow, tile, fetch):
-        """GAIN times the cost volume around the flow, and its soft arg-max. One operator in the fused graph of export.py."""
+        """GAIN times the cost volume around the flow, its soft arg-max, and the flow as the convolutions read it. One operator in
+        the fused graphs of export.py."""
         fetched = warp(newer.float(), flow).to(newer.dtype) if fetch else newer
         volume = cost_volume(older, fetched, tile, self.reach)
         pooled = F.avg_pool2d(volume.float(), 3, 1, 1, count_include_pad=False)
         weights = torch.softmax(pooled * self.sharpness.exp(), 1)
-        return volume * GAIN, torch.einsum("bdyx,cd->bcyx", weights, self.offsets)
+        return volume * GAIN, torch.einsum("bdyx,cd->bcyx", weights, self.offsets), FLOW_GAIN * flow
 
     def layers(self, parts):
         """The residual in fp32, and the body's features. One operator in the fused graphs of export.py."""
@@ -200,13 +215,15 @@ class LevelDecoder(nn.Module):
         features = through(self.body, parts)
         return self.predict(features).float(), features
 
+    def moved(self, flow, residual, argmax):
+        """The flow after a look. One operator in the fused graphs of export.py."""
+        return flow + residual[:, :2] + torch.sigmoid(residual[:, 2:]) * argmax
+
     def forward(self, older, newer, context, flow, above, tile, fetch=True):
         """Flow [B, 2, H, W] and body features, from those of the level above at this level's size."""
-        volume, argmax = self.match(older, newer, flow, tile, fetch)
-        # Flow is of the size of a cost volume's reach, and larger at large motion only.
-        parts = [volume, argmax.to(volume.dtype), context, (0.25 * flow).to(volume.dtype), above]
-        residual, features = self.layers(parts)
-        return flow + residual[:, :2] + torch.sigmoid(residual[:, 2:]) * argmax, features
+        volume, argmax, read = self.match(older, newer, flow, tile, fetch)
+        residual, features = self.layers([volume, argmax.to(volume.dtype), context, read.to(volume.dtype), above])
+        return self.moved(flow, residual, argmax), features
 
 
 def error_head() -> nn.Sequential:
@@ -232,29 +249,29 @@ class Decoder(nn.Module):
         self.fine = LevelDecoder(NARROW_REACH, QUARTER, DECODER_CHANNELS[-1], NARROW_CHANNELS, dense)
         self.error, self.fast_error = error_head(), error_head()
         # What export.py exchanges for operators of the node's own, or for ONNX's that PyTorch does not have.
-        self.through, self.halved, self.twice = through, halved, twice
+        self.through, self.resized = through, resized
 
     def forward(self, older, newer, fast: bool = False):
         matched = {3: (older[1], newer[1], older[2])}
         for level in range(FINEST_SHARED + 1, COARSEST + 1):
-            matched[level] = tuple(self.halved(m) for m in matched[level - 1])
+            matched[level] = self.resized(halved, *matched[level - 1])
         coarse = matched[COARSEST][0]
         flow, above = torch.zeros_like(coarse[:, :2]).float(), torch.zeros_like(coarse[:, : DECODER_CHANNELS[-1]])
         flows = []
         for level, looks in LOOKS.items():
             if level < COARSEST:
-                flow = 2.0 * F.interpolate(flow, scale_factor=2, mode="bilinear", align_corners=False)
-                above = F.interpolate(above, scale_factor=2, mode="bilinear", align_corners=False)
+                flow, above = self.resized(doubled, flow, above, gains=(2.0, 1.0))
             for _ in range(looks):
                 fetch = len(flows) > 0
                 flow, above = self.shared(*matched[level], flow, above, columns(level, flow.device), fetch)
                 flows.append(flow)
-        flows[-1] = flow = flow + self.through(self.context, [above, (0.25 * flow).to(above.dtype)]).float()
-        flow = 2.0 * self.twice(flow)
+        flows[-1] = flow = flow + self.through(self.context, [above, (FLOW_GAIN * flow).to(above.dtype)]).float()
         coarser = F.softplus(self.through(self.fast_error, [above.detach()]).float()) + 0.01 if fast or self.training else None
         if fast:
-            return [*flows, flow], self.twice(coarser)
-        flow, features = self.fine(older[0], newer[0], older[0], flow, self.twice(above), columns(2, flow.device))
+            flow, expected = self.resized(twice, flow, coarser, gains=(2.0, 1.0))
+            return [*flows, flow], expected
+        flow, above = self.resized(twice, flow, above, gains=(2.0, 1.0))
+        flow, features = self.fine(older[0], newer[0], older[0], flow, above, columns(2, flow.device))
         expected = F.softplus(self.through(self.error, [features.detach()]).float()) + 0.01
         return [*flows, flow], [coarser, expected] if self.training else expected
 

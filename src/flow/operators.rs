@@ -11,12 +11,13 @@ use ort::{
     operator::{ComputeContext, OperatorDomain},
 };
 
-use crate::flow::{convolutions, cost_volume, normalised};
+use crate::flow::{convolutions, cost_volume, moved, normalised, resized};
 
 /// What a session needs to run graphs with them.
 pub fn domain() -> Result<OperatorDomain> {
     let domain = OperatorDomain::new("nightflow")?.add(cost_volume::Fused)?.add(normalised::Normalise)?;
-    domain.add(convolutions::Convolutions)?.add(convolutions::Encode)
+    let domain = domain.add(convolutions::Convolutions)?.add(convolutions::Encode)?;
+    domain.add(resized::Resized)?.add(moved::Moved)
 }
 
 /// An input's values and lengths. Neither takes memory, which `ComputeContext::input` does.

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 import torch
 
@@ -14,9 +13,9 @@ import checkpoints
 import dense
 import int8
 from export import (GOLDEN_COLUMNS, GOLDEN_ROWS, OPSET, USUAL_STRIDE, Exported, gigamacs, golden_frames, graphs_of,
-                    halved_as_one, manifest_entry, moved, parity, rounded, traced, twice_as_one, write_manifest)
+                    manifest_entry, moved, parity, rounded, write_manifest)
 from flownet import FlowNetS
-from networks import STRIDE, PwcNet, halved, twice
+from networks import STRIDE, PwcNet
 from raft import RaftSmall
 
 MODELS = Path(__file__).parents[2] / "models"
@@ -146,8 +145,16 @@ def test_graphs_of_own_operators_are_called_alike_and_convolve_by_them(fresh, bi
             assert np.allclose(view.pop("slopes"), [1.0, 0.1]) and view.pop("bits", 16) == bits
             assert view == {"factor": 2.0, "offset": -1.0, "shift": 2}
             continue
-        assert set(given) == {"CostVolume", "Convolutions"}
+        assert set(given) == {"CostVolume", "Convolutions", "Moved", "Resized"}
         of = lambda node, name: next(onnx.helper.get_attribute_value(a) for a in node.attribute if a.name == name)
+        # To levels 4 and 5, from there to 4 and 3, then to 2.
+        resized = [(of(node, "rule"), of(node, "gains")) for node in own.graph.node if node.op_type == "Resized"]
+        both = [2.0, 1.0]
+        assert resized == [(b"halved", [1.0] * 3)] * 2 + [(b"doubled", both)] * 2 + [(b"between", both)]
+        # What a level's convolutions read of the flow comes out of its match, and the flow is moved after each look.
+        matched = [node for node in own.graph.node if node.op_type == "CostVolume"]
+        assert [of(node, "part") for node in matched] == [0.25] * len(matched)
+        assert sum(node.op_type == "Moved" for node in own.graph.node) == len(matched)
         parts, layers = [of(node, "parts") for node in chains], [len(of(node, "slopes")) for node in chains]
         # Levels 5, 4, 3 and 3 again, the context network, level 2, a head for the expected error.
         assert parts == [5, 5, 5, 5, 2] + ([1] if network.fast else [5, 1])
@@ -186,21 +193,6 @@ def test_an_untrained_dense_network_comes_with_a_manifest(tmp_path, monkeypatch)
     assert entry["gigamacs"] == pytest.approx(5.870, abs=1e-3)
     with pytest.raises(SystemExit, match="without a manifest"):
         dense.main()
-
-
-@pytest.mark.parametrize("plain, one", [(twice, twice_as_one), (halved, halved_as_one)])
-def test_resizing_by_one_operator_is_the_same(plain, one):
-    class Wrapped(torch.nn.Module):
-        def forward(self, values):
-            return one(values)
-
-    values = torch.rand(1, 3, 6, 10)
-    graph = traced(Wrapped(), (values,), ["values"], ["found"], {"values": {2: "rows", 3: "columns"}})
-    assert [node.op_type for node in graph.graph.node if node.op_type != "Constant"] == ["Resize"]
-    session = onnxruntime.InferenceSession(graph.SerializeToString(), providers=["CPUExecutionProvider"])
-    for values in (values, torch.rand(1, 3, 8, 4)):
-        found = session.run(None, {"values": values.numpy()})[0]
-        np.testing.assert_allclose(found, plain(values).numpy(), atol=1e-6)
 
 
 def test_golden_frames_follow_their_formula():

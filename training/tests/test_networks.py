@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from networks import LOOKS, SHIFT, STRIDE, PwcNet, columns, cost_volume, cost_volume_plain, halved, twice
+from networks import LOOKS, SHIFT, STRIDE, PwcNet, columns, cost_volume, cost_volume_plain, doubled, halved, resized, twice
 
 
 @pytest.mark.parametrize(
@@ -134,6 +134,17 @@ def test_cells_look_where_their_truth_is():
     assert torch.equal(halved(eighth)[0, 0, 0], SHIFT + 4 + 16 * torch.arange(8.0))
     assert torch.equal(twice(eighth)[0, 0, 0, :-1], SHIFT + 4 * torch.arange(31.0))
     assert torch.equal(PwcNet.truth(ramp, 4)[0, 0, 0], 1.5 + 4 * torch.arange(32.0))
+
+
+def test_what_is_resized_is_so_by_its_rule_and_gain():
+    values = [torch.rand(1, count, 4, 6) for count in (2, 3)]
+    for rule in (halved, doubled, twice):
+        for gains in (None, (2.0, 1.0)):
+            found = resized(rule, *values, gains=gains)
+            for value, gain, found in zip(values, gains or (1.0, 1.0), found, strict=True):
+                assert torch.equal(found, gain * rule(value))
+    # A cell becomes four that lie evenly around it.
+    torch.testing.assert_close(doubled(torch.tensor([[[[0.0, 4.0]]]])), torch.tensor([[[[0.0, 1.0, 3.0, 4.0]] * 2]]))
 
 
 def test_published_weights_fit_or_are_refused(tmp_path):

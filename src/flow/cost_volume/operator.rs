@@ -16,13 +16,16 @@ const NAME: &str = "CostVolume";
 /// Fewer products than these are not worth waking other threads for: they take some ten microseconds.
 const PRODUCTS_SPREAD_MIN: usize = 500_000;
 
-/// The operator `nightflow::CostVolume`.
+/// The operator `nightflow::CostVolume`. If the node has a third output, that is the flow that went in, multiplied with the attribute
+/// `part`.
 pub struct Fused;
 
 /// A node of a graph.
 pub struct Node {
     reach: usize,
     gain: f32,
+    /// What the flow is multiplied with that comes out as it went in.
+    part: f32,
     /// The flow as the plain graph sees it.
     rounded: Vec<f32>,
     work: CostVolume,
@@ -79,7 +82,8 @@ impl Operator for Fused {
     }
 
     fn outputs(&self) -> impl IntoIterator<Item = OperatorOutput> {
-        [const { OperatorOutput::required(TensorElementType::Float32) }; 2]
+        let required = [const { OperatorOutput::required(TensorElementType::Float32) }; 2];
+        required.into_iter().chain([OperatorOutput::optional(TensorElementType::Float32)])
     }
 
     fn create_kernel<'attr>(&self, attributes: &KernelContext<'attr>) -> Result<Node> {
@@ -87,7 +91,8 @@ impl Operator for Fused {
         if !gain.is_normal() {
             return Err(Error::new(format!("CostVolume: gain should be finite and not zero, it is {gain}")));
         }
-        Ok(Node { reach: reach(attributes.get("reach"))?, gain, rounded: vec![], work: CostVolume::default() })
+        let part = attributes.get("part").unwrap_or(1.0);
+        Ok(Node { reach: reach(attributes.get("reach"))?, gain, part, rounded: vec![], work: CostVolume::default() })
     }
 }
 
@@ -110,6 +115,10 @@ impl Kernel for Node {
         let inputs = Inputs { older, newer, flow: &self.rounded, sharpness: sharpness[0], gain: self.gain };
         let volume = output(context, 0, [1, shape.displacements() as i64, lengths[2], lengths[3]])?;
         let argmax = output(context, 1, [1, 2, lengths[2], lengths[3]])?;
+        if context.num_outputs()? > 2 {
+            let to = output(context, 2, [1, 2, lengths[2], lengths[3]])?;
+            to.iter_mut().zip(flow).for_each(|(to, flow)| *to = self.part * flow);
+        }
         let products = shape.cells().saturating_mul(channels).saturating_mul(shape.displacements());
         self.work.compute(shape, &inputs, Outputs { volume, argmax }, |count, work| {
             if products < PRODUCTS_SPREAD_MIN {
