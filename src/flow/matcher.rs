@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use tracing::debug;
+
 use crate::{
     clock::Stamp,
     exposure::{Exposed, Pair},
@@ -12,12 +14,15 @@ use crate::{
         network::{Model, Network, Raster, Slot},
         onnx::Onnx,
         padding::{self, Padded},
+        pages,
         refine::Refiner,
     },
 };
 
 /// Pixels of the network's image in one cell of its raster.
 const CELL: usize = 4;
+/// So many sizes of frames have their memory moved to large pages: whoever has more has no steps to hurry for.
+const SIZES_MAX: usize = 16;
 
 /// Dense flow between the frames of a pair.
 pub struct Matcher {
@@ -30,6 +35,8 @@ pub struct Matcher {
     flow: Vec<f32>,
     uncertainty: Vec<f32>,
     counts: Counts,
+    /// Width and height of frames whose memory has been moved to large pages.
+    settled: Vec<[usize; 2]>,
 }
 
 /// What makes a frame's features what they are. The stamp is in it for frames that nobody numbered.
@@ -81,6 +88,7 @@ impl Matcher {
             flow: vec![],
             uncertainty: vec![],
             counts: Counts::default(),
+            settled: vec![],
         }
     }
 
@@ -169,9 +177,21 @@ impl Matcher {
             }
         }
         mask(pair, &grid, canvas.flow, canvas.confidence);
+        self.settle([older.width, older.height]);
         let lender: &'a dyn Lender = lender;
         let (vectors, confidence) = lender.lent();
         Ok(Flow { older: older.stamp, newer: newer.stamp, grid, vectors, confidence })
+    }
+
+    /// After the first pair of a size all memory is taken.
+    fn settle(&mut self, size: [usize; 2]) {
+        if self.config.large_pages && self.settled.len() < SIZES_MAX && !self.settled.contains(&size) {
+            self.settled.push(size);
+            match pages::enlarge() {
+                Ok(pages::Moved { large, of }) => debug!("{} of {} MiB lie on large pages", large >> 20, of >> 20),
+                Err(why) => debug!("memory stays on small pages: {why}"),
+            }
+        }
     }
 
     /// Sees to it that both frames' features are there, computing only those that are not; where the older's are.

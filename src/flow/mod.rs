@@ -19,6 +19,7 @@ mod onnx_graph;
 mod onnx_shared;
 mod operators;
 pub mod padding;
+pub mod pages;
 pub mod profile;
 mod provider;
 mod refine;

@@ -8,7 +8,12 @@ use nightflow::{
     clock,
     config::Config,
     exposure::Developer,
-    flow::{self, Matcher, Precision, Provider, convolutions::Unit, manifest},
+    flow::{
+        self, Matcher, Precision, Provider,
+        convolutions::Unit,
+        manifest,
+        pages::{self, Moved},
+    },
     publish::iceoryx2::{bytes_needed, free_bytes},
 };
 
@@ -16,7 +21,6 @@ use crate::{
     Exit,
     bench::ours::{self, Ours},
     launch,
-    pages::{self, Pages},
 };
 
 /// A receive buffer below this loses most of a camera's fragments (measured: 93 % of VGA frames at 208 KiB).
@@ -37,6 +41,9 @@ pub struct Args {
     wait: f64,
 }
 
+/// The network's usual size.
+const SIZE: [usize; 2] = [320, 256];
+
 /// How a check came out.
 enum Finding {
     Ok(String),
@@ -47,7 +54,7 @@ enum Finding {
 /// Prints every check, then how many must be acted upon.
 pub fn run(args: Args) -> Result<Exit> {
     let config = launch::read(args.config.as_deref())?;
-    let mut checks = vec![("processor", processor()), ("memory pages", memory_pages())];
+    let mut checks = vec![("processor", processor())];
     checks.extend(network(&config));
     checks.push(("shared memory", shared_memory(&config)));
     checks.push(("socket buffers", sockets(&config)));
@@ -92,11 +99,14 @@ fn processor() -> Finding {
     Finding::Ok(text)
 }
 
-fn memory_pages() -> Finding {
-    Finding::Ok(match pages::found() {
-        Pages::Huge => "huge ones where they fit".into(),
-        Pages::Unasked => format!("small ones; started with {} a running node is faster", pages::SETTING.join("=")),
-        Pages::Small => "small ones: the kernel gives no transparent huge pages".into(),
+/// On what pages the memory lies that was used so far.
+fn memory_pages(flow: &flow::Config) -> Finding {
+    if !flow.large_pages {
+        return Finding::Ok("small ones: [flow] large_pages is off".into());
+    }
+    Finding::Ok(match pages::enlarge() {
+        Ok(Moved { large, of }) => format!("large ones for {} of {} MiB", large >> 20, of >> 20),
+        Err(why) => format!("small ones, steps take a little longer: {why}"),
     })
 }
 
@@ -117,6 +127,7 @@ fn network(config: &Config) -> Vec<(&'static str, Finding)> {
         Ok(None) => Finding::Warning("the manifest holds no golden output for this network".into()),
         Err(error) => Finding::Do(error.to_string()),
     };
+    let mut ours = Ours::with(matcher, ours::frames(SIZE[0], SIZE[1]));
     vec![
         ("runtime", Finding::Ok(format!("{}, {}", model.provider, model.library.display()))),
         (
@@ -130,7 +141,8 @@ fn network(config: &Config) -> Vec<(&'static str, Finding)> {
             )),
         ),
         ("golden output", golden),
-        ("speed", speed(matcher, may_be_faster(&config.flow))),
+        ("speed", speed(&mut ours, may_be_faster(&config.flow))),
+        ("memory pages", memory_pages(&config.flow)),
     ]
 }
 
@@ -144,9 +156,7 @@ fn may_be_faster(flow: &flow::Config) -> bool {
 }
 
 /// The median of five steps at the network's usual size, each with one new frame, as in a running node.
-fn speed(matcher: Matcher, may_be_faster: bool) -> Finding {
-    let (width, height) = (320, 256);
-    let mut ours = Ours::with(matcher, ours::frames(width, height));
+fn speed(ours: &mut Ours, may_be_faster: bool) -> Finding {
     let mut took = Vec::new();
     for _ in 0..6 {
         match ours.step() {
@@ -158,6 +168,7 @@ fn speed(matcher: Matcher, may_be_faster: bool) -> Finding {
     took.remove(0);
     took.sort_by(f64::total_cmp);
     let median = took[took.len() / 2];
+    let [width, height] = SIZE;
     let way = if may_be_faster { "; [flow] precision = \"bf16\" is faster on this processor" } else { "" };
     Finding::Ok(format!("{median:.0} ms a step at {width}×{height}, up to {:.0} Hz{way}", 1e3 / median))
 }

@@ -7,7 +7,6 @@ mod doctor;
 mod eval;
 mod launch;
 mod noise;
-mod pages;
 mod record;
 mod replay;
 mod run;

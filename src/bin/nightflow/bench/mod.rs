@@ -17,6 +17,7 @@ use nightflow::{
     flow::{
         Config, Matcher, Operators, Precision, Provider, Resolution, convolutions,
         manifest::{self, Entry},
+        pages,
     },
 };
 
@@ -204,6 +205,14 @@ impl<'a> Bench<'a> {
         }
     }
 
+    /// Once the memory of all was measured, by giving back what was free: that cuts large pages up.
+    fn settle(&self) {
+        if self.config.large_pages {
+            // What can't be moved stays where it is, for everybody alike.
+            pages::enlarge().ok();
+        }
+    }
+
     /// Every network, what refining adds, the product of matrices and the rivals, all in turns.
     fn steps(&self, report: &mut Report) -> Result<()> {
         let (Size(size @ [width, height]), threads) = (self.args.size, self.threads);
@@ -236,6 +245,7 @@ impl<'a> Bench<'a> {
         turns.append(&mut rivals.turns);
         // What is compared most goes side by side.
         turns.sort_by_key(|turn| self.place(&turn.what));
+        self.settle();
         let bar = progress(turns.len(), self.args.rounds.into(), "the step")?;
         report.steps = mended(turns::take(&mut turns, self.args.rounds.into(), &bar), &mut rivals.left_out)?;
         bar.finish_and_clear();
@@ -284,6 +294,7 @@ impl<'a> Bench<'a> {
                 report.sizes.push((size, threads));
             }
         }
+        self.settle();
         let bar = progress(turns.len(), rounds, "how its cost grows")?;
         report.growth = mended(turns::take(&mut turns, rounds, &bar), &mut vec![])?;
         bar.finish_and_clear();
