@@ -21,6 +21,9 @@ const CHUNK: usize = 8;
 /// About how many bands a picture is cut into, and the least tiles of one: weights are fetched once for each.
 const BANDS: usize = 8;
 const TILES_LEAST: usize = 32;
+/// The same for two equal bands where there would be one: they are worth more than weights, for bands of outputs transform the
+/// same tiles.
+const TILES_HALF: usize = 8;
 /// As if there were so many where there are fewer: weights take as long then as the products with them.
 const TILES_FEW: usize = 24;
 /// Outputs are cut at multiples of this, for so many are multiplied at once.
@@ -130,10 +133,12 @@ impl Layer {
         let group = self.form.out() * self.dilation;
         let (groups, tiles) = (height.div_ceil(group).max(1), self.dilation * width.div_ceil(self.form.out()).max(1));
         let rows = groups.div_ceil(BANDS).max(TILES_LEAST.div_ceil(tiles));
+        let halves = groups.is_multiple_of(2) && groups * tiles >= 2 * TILES_HALF;
+        let rows = if rows >= groups && halves { groups / 2 } else { rows };
         group * groups.div_ceil(groups.div_ceil(rows))
     }
 
-    /// Outputs of a band: half of them where the rows are one band, too few or too far apart for more, else all.
+    /// Outputs of a band: half of them where the rows are one band, too few or too far apart for two, else all.
     pub fn part(&self, size: [usize; 2]) -> usize {
         let outputs = self.bias.len();
         if self.band(size) < size[0] { outputs } else { outputs.div_ceil(2).next_multiple_of(PART).min(outputs) }

@@ -60,7 +60,9 @@ pub fn multiply<L: Lanes>(lanes: L, factors: Factors<'_>, to: &mut [f32], output
         let those = &those[begin * wide..end * wide];
         let mut tile = 0;
         while tile < factors.count {
-            let left = (factors.count - tile).min(most);
+            let left = factors.count - tile;
+            // Blocks that are as good as equal: sums of a small one wait for each other.
+            let left = left.div_ceil(left.div_ceil(most)).next_multiple_of(STEP);
             let to = &mut to[tile * outputs + first..];
             let factors = Factors { weights: those, following: ahead.next().unwrap_or(&[]), ..factors };
             match (vectors, left) {
