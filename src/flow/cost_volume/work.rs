@@ -3,7 +3,7 @@
 use super::{
     Shape,
     bands::Band,
-    lanes::{self, Lanes, TILE, Work},
+    lanes::{self, Lanes, TILE, Work, fetch},
 };
 
 /// Displacements that are summed at once; with two rows of the older frame that is ten sums, which just fit the sixteen
@@ -44,6 +44,10 @@ impl Turn<'_> {
         let from = &self.newer[c * plane + y * width + x..];
         let to = &mut self.to.row(0, y)[x * depth + c..];
         if width - x >= TILE && channels - c >= TILE {
+            // Of the next row: planes lie too far apart for a processor to foresee.
+            for i in 0..TILE {
+                fetch(from.get(i * plane + width..i * plane + width + TILE).unwrap_or(&[]));
+            }
             lanes.turn(from, plane, to, depth);
         } else {
             for i in 0..TILE.min(channels - c) {
@@ -189,6 +193,8 @@ impl Multiply<'_> {
     fn pack(&mut self, count: usize, x: usize, y: usize) {
         let Shape { channels, height, width, .. } = *self.shape;
         let some = count.min(width - x);
+        // What comes then, at the end of the rows that of the next two.
+        let next = if x + count < width { x + count } else { 2 * width };
         let planes = self.older.chunks_exact(height * width).take(channels);
         for (to, plane) in self.scratch.chunks_exact_mut(2 * count).zip(planes) {
             let (upper, lower) = to.split_at_mut(count);
@@ -201,6 +207,7 @@ impl Multiply<'_> {
                 } else {
                     to.fill(0.0);
                 }
+                fetch(plane.get(next + y * width..next + y * width + count).unwrap_or(&[]));
             }
         }
     }
