@@ -55,6 +55,7 @@ pub(super) struct Warp {
     valid: Vec<f32>,
     /// Where each pixel of the older frame stands in the newer one, x then y.
     places: [Vec<f32>; 2],
+    reads: Vec<Reads>,
     /// Vectors of a row of cells, with one more at either end.
     line: [Vec<f32>; 2],
     /// The products of a row of cells, pixel by pixel.
@@ -75,8 +76,10 @@ impl Warp {
         for plane in [&mut self.mean, &mut self.difference, &mut self.valid] {
             plane.resize(width * height, 0.0);
         }
-        self.places.iter_mut().for_each(|places| places.resize(CELL * raster[0], 0.0));
+        let pixels = (CELL * raster[0]).next_multiple_of(SIDE_BY_SIDE);
+        self.places.iter_mut().for_each(|places| places.resize(pixels, 0.0));
         self.line.iter_mut().for_each(|line| line.resize(raster[0] + 2, 0.0));
+        self.reads.resize((CELL * raster[0]).div_ceil(SIDE_BY_SIDE), Reads::default());
         self.valid.fill(0.0);
         let covered = CELL * raster[0];
         let marks = |exposed: &'_ Exposed| exposed.saturated_part > 0.0;
@@ -85,7 +88,8 @@ impl Warp {
             self.place(y, raster, start, change);
             let row = y * width..y * width + covered;
             let out = [&mut self.mean[row.clone()], &mut self.difference[row.clone()], &mut self.valid[row.clone()]];
-            sample(newer, hidden, [width, height], y, [&self.places[0], &self.places[1]], &older[row], out);
+            weigh(&mut self.reads, [width, height], y, [&self.places[0], &self.places[1]]);
+            sample(newer, hidden, width, &self.reads, &older[row], out);
         }
         if marks(pair.older) {
             for (valid, mark) in self.valid.iter_mut().zip(&pair.older.saturated) {
@@ -145,35 +149,71 @@ impl Warp {
     }
 }
 
-/// Reads `newer` where the pixels of one row went, by Catmull and Rom's cubic; not where `hidden` marks it.
+/// Pixels whose weights are found at once.
+const SIDE_BY_SIDE: usize = 16;
+
+/// From which sixteen pixels each of some is read, and what they weigh, by Catmull and Rom's cubic.
+#[derive(Debug, Clone, Copy, Default)]
+struct Reads {
+    /// The first of them, or [`NOWHERE`].
+    first: [i32; SIDE_BY_SIDE],
+    /// Weights of their columns, and of their rows.
+    across: [[f32; SIDE_BY_SIDE]; 4],
+    down: [[f32; SIDE_BY_SIDE]; 4],
+}
+
+/// The place is not in the image, or too near to its edge.
+const NOWHERE: i32 = -1;
+
+/// By where the pixels of row `y` went.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn weigh(reads: &mut [Reads], [width, height]: [usize; 2], y: usize, places: [&[f32]; 2]) {
+    let (right, bottom) = ((width - 2) as f32, (height - 2) as f32);
+    let [u, v] = places.map(|places| places.as_chunks::<SIDE_BY_SIDE>().0);
+    for (block, (reads, (u, v))) in reads.iter_mut().zip(u.iter().zip(v)).enumerate() {
+        for i in 0..SIDE_BY_SIDE {
+            let (to_x, to_y) = ((block * SIDE_BY_SIDE + i) as f32 + u[i], y as f32 + v[i]);
+            // Asked this way round, a NaN is outside.
+            let inside = (to_x >= 1.0) & (to_y >= 1.0) & (to_x < right) & (to_y < bottom);
+            let (to_x, to_y) = (if inside { to_x } else { 1.0 }, if inside { to_y } else { 1.0 });
+            let (column, row) = (to_x as i32, to_y as i32);
+            let first = (row - 1) * width as i32 + column - 1;
+            reads.first[i] = if inside { first } else { NOWHERE };
+            let (of_columns, of_rows) = (cubic(to_x - column as f32), cubic(to_y - row as f32));
+            for tap in 0..4 {
+                reads.across[tap][i] = of_columns[tap];
+                reads.down[tap][i] = of_rows[tap];
+            }
+        }
+    }
+}
+
+/// Reads `newer` where the pixels of one row went; not where `hidden` marks it.
 fn sample(
     newer: &[f32],
     hidden: &[u8],
-    [width, height]: [usize; 2],
-    y: usize,
-    places: [&[f32]; 2],
+    width: usize,
+    reads: &[Reads],
     older: &[f32],
     [mean, difference, valid]: [&mut [f32]; 3],
 ) {
-    let (right, bottom) = ((width - 2) as f32, (height - 2) as f32);
-    for (x, (u, v)) in places[0].iter().zip(places[1]).enumerate() {
-        let (to_x, to_y) = (x as f32 + u, y as f32 + v);
-        // Asked this way round, a NaN is outside.
-        let inside = to_x >= 1.0 && to_y >= 1.0 && to_x < right && to_y < bottom;
-        if !inside {
+    for x in 0..older.len() {
+        let (Reads { first, across, down }, i) = (&reads[x / SIDE_BY_SIDE], x % SIDE_BY_SIDE);
+        let Ok(first) = usize::try_from(first[i]) else {
             (mean[x], difference[x]) = (older[x], 0.0);
             continue;
-        }
-        let (column, row) = (to_x as usize, to_y as usize);
-        let (across, down) = (cubic(to_x - column as f32), cubic(to_y - row as f32));
-        let from = &newer[(row - 1) * width + column - 1..][..3 * width + 4];
-        let line = |at: usize| {
-            let four = &from[at..at + 4];
-            four[0] * across[0] + four[1] * across[1] + (four[2] * across[2] + four[3] * across[3])
         };
-        let value = line(0) * down[0] + line(width) * down[1] + (line(2 * width) * down[2] + line(3 * width) * down[3]);
+        let [across, down] = [across, down].map(|weights| weights.map(|of_tap| of_tap[i]));
+        let rows: [&[f32]; 4] = std::array::from_fn(|row| &newer[first + row * width..][..4]);
+        // Four columns at once: they lie side by side.
+        let columns: [f32; 4] = std::array::from_fn(|at| {
+            rows[0][at] * down[0] + rows[1][at] * down[1] + (rows[2][at] * down[2] + rows[3][at] * down[3])
+        });
+        let value = columns[0] * across[0] + columns[1] * across[1] + (columns[2] * across[2] + columns[3] * across[3]);
         (mean[x], difference[x]) = (0.5 * (older[x] + value), value - older[x]);
-        let nearest = (to_y + 0.5) as usize * width + (to_x + 0.5) as usize;
+        // The nearest of the sixteen is one of the middle four.
+        let further = |weights: [f32; 4]| usize::from(weights[2] > weights[1]);
+        let nearest = first + (1 + further(down)) * width + 1 + further(across);
         valid[x] = 1.0 - f32::from(hidden.get(nearest).copied().unwrap_or(0));
     }
 }
