@@ -14,7 +14,7 @@ use crate::{
         network::{Model, Network, Raster, Slot},
         onnx::Onnx,
         padding::{self, Padded},
-        pages,
+        pages::{Moved, Moving},
         refine::Refiner,
     },
 };
@@ -37,6 +37,7 @@ pub struct Matcher {
     counts: Counts,
     /// Width and height of frames whose memory has been moved to large pages.
     settled: Vec<[usize; 2]>,
+    moving: Option<Moving>,
 }
 
 /// What makes a frame's features what they are. The stamp is in it for frames that nobody numbered.
@@ -89,6 +90,7 @@ impl Matcher {
             uncertainty: vec![],
             counts: Counts::default(),
             settled: vec![],
+            moving: None,
         }
     }
 
@@ -183,12 +185,17 @@ impl Matcher {
         Ok(Flow { older: older.stamp, newer: newer.stamp, grid, vectors, confidence })
     }
 
-    /// After the first pair of a size all memory is taken.
+    /// After the first pair of a size all memory is taken, and goes to large pages, one with every pair.
     fn settle(&mut self, size: [usize; 2]) {
         if self.config.large_pages && self.settled.len() < SIZES_MAX && !self.settled.contains(&size) {
             self.settled.push(size);
-            match pages::enlarge() {
-                Ok(pages::Moved { large, of }) => debug!("{} of {} MiB lie on large pages", large >> 20, of >> 20),
+            self.moving = Moving::found().inspect_err(|why| debug!("memory stays on small pages: {why}")).ok();
+        }
+        if self.moving.as_mut().is_some_and(|moving| !moving.step())
+            && let Some(moving) = self.moving.take()
+        {
+            match moving.end() {
+                Ok(Moved { large, of }) => debug!("{} of {} MiB lie on large pages", large >> 20, of >> 20),
                 Err(why) => debug!("memory stays on small pages: {why}"),
             }
         }

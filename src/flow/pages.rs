@@ -2,7 +2,8 @@
 //! weights and maps lie.
 //!
 //! Linux gives large pages to whoever asks for them before memory is first touched, which neither an allocator nor ONNX Runtime
-//! does, and since 6.1 at any time: then what is there is moved. So the node asks once all memory of a size of frames is taken.
+//! does, and since 6.1 at any time: then what is there is moved. So the node asks once all memory of a size of frames is taken, for a
+//! piece with every step: all at once would cost a stream some frames.
 
 use std::{
     fs::{self, File},
@@ -50,38 +51,65 @@ pub struct Moved {
     pub of: usize,
 }
 
-/// Moves the private memory of this process to large pages, where a whole one is in use. Nothing in it changes.
-pub fn enlarge() -> Result<Moved, Small> {
-    if text(ENABLED)?.contains("[never]") {
-        return Err(Small::Never);
+/// Memory that is to lie on large pages.
+#[derive(Debug)]
+pub struct Moving {
+    /// Where pieces begin that are still to be moved, and their size.
+    left: Vec<usize>,
+    large: usize,
+    moved: Moved,
+    refused: Option<io::Error>,
+}
+
+impl Moving {
+    /// The private memory of this process, as far as whole large pages of it are in use.
+    pub fn found() -> Result<Self, Small> {
+        if text(ENABLED)?.contains("[never]") {
+            return Err(Small::Never);
+        }
+        let wrong = |reason: &str| Small::Read { path: SIZE.into(), reason: io::Error::other(reason.to_owned()) };
+        let large: usize = text(SIZE)?.trim().parse().map_err(|_| wrong("expected a number of bytes"))?;
+        // SAFETY: it takes a number and gives one.
+        let small = usize::try_from(unsafe { libc::sysconf(libc::_SC_PAGESIZE) }).unwrap_or(0);
+        if small == 0 || large < 2 * small {
+            return Err(wrong("expected more than a small page"));
+        }
+        let mut pagemap = File::open(PAGEMAP).map_err(|reason| failed(PAGEMAP, reason))?;
+        let (mut left, mut entries) = (vec![], vec![0; large / small * size_of::<u64>()]);
+        for memory in text(MAPS)?.lines().filter_map(private) {
+            let pieces = (memory.start.next_multiple_of(large)..memory.end).step_by(large);
+            let whole = pieces.filter(|first| first + large <= memory.end);
+            left.extend(whole.filter(|first| used(&mut pagemap, first / small, &mut entries)));
+        }
+        let moved = Moved { large: 0, of: large * left.len() };
+        Ok(Self { left, large, moved, refused: None })
     }
-    let wrong = |reason: &str| Small::Read { path: SIZE.into(), reason: io::Error::other(reason.to_owned()) };
-    let large: usize = text(SIZE)?.trim().parse().map_err(|_| wrong("expected a number of bytes"))?;
-    // SAFETY: it takes a number and gives one.
-    let small = usize::try_from(unsafe { libc::sysconf(libc::_SC_PAGESIZE) }).unwrap_or(0);
-    if small == 0 || large < 2 * small {
-        return Err(wrong("expected more than a small page"));
-    }
-    let mut pagemap = File::open(PAGEMAP).map_err(|reason| failed(PAGEMAP, reason))?;
-    let (mut moved, mut refused) = (Moved { large: 0, of: 0 }, None);
-    let mut entries = vec![0; large / small * size_of::<u64>()];
-    for memory in text(MAPS)?.lines().filter_map(private) {
-        for first in (memory.start.next_multiple_of(large)..memory.end).step_by(large) {
-            let fits = first + large <= memory.end && used(&mut pagemap, first / small, &mut entries);
-            if !fits {
-                continue;
-            }
-            moved.of += large;
-            match ask(first, large) {
-                Ok(()) => moved.large += large,
-                Err(why) => refused = Some(why),
+
+    /// Moves a piece, which takes some milliseconds at most; whether there are more. Nothing in it changes.
+    pub fn step(&mut self) -> bool {
+        if let Some(first) = self.left.pop() {
+            match ask(first, self.large) {
+                Ok(()) => self.moved.large += self.large,
+                Err(why) => self.refused = Some(why),
             }
         }
+        !self.left.is_empty()
     }
-    match refused {
-        Some(why) if moved.large == 0 => Err(Small::Refused(why)),
-        _ => Ok(moved),
+
+    /// What became of it.
+    pub fn end(self) -> Result<Moved, Small> {
+        match self.refused {
+            Some(why) if self.moved.large == 0 => Err(Small::Refused(why)),
+            _ => Ok(self.moved),
+        }
     }
+}
+
+/// Moves all of it at once.
+pub fn enlarge() -> Result<Moved, Small> {
+    let mut moving = Moving::found()?;
+    while moving.step() {}
+    moving.end()
 }
 
 fn text(path: &str) -> Result<String, Small> {
@@ -114,14 +142,12 @@ fn used(pagemap: &mut File, first: usize, entries: &mut [u8]) -> bool {
 }
 
 fn ask(first: usize, length: usize) -> io::Result<()> {
-    for advice in [libc::MADV_HUGEPAGE, libc::MADV_COLLAPSE] {
-        // SAFETY: both say on what pages memory should lie and leave what is in it as it is; if there is none any more, the kernel
-        // says so.
-        if unsafe { libc::madvise(std::ptr::without_provenance_mut(first), length, advice) } != 0 {
-            return Err(io::Error::last_os_error());
-        }
+    // Not `MADV_HUGEPAGE`, which lasts: whoever takes memory there later would wait for a large page to be made free and cleared.
+    // SAFETY: it says on what pages memory should lie and leaves what is in it as it is; if there is none any more, the kernel says so.
+    match unsafe { libc::madvise(std::ptr::without_provenance_mut(first), length, libc::MADV_COLLAPSE) } {
+        0 => Ok(()),
+        _ => Err(io::Error::last_os_error()),
     }
-    Ok(())
 }
 
 #[cfg(test)]
