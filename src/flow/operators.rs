@@ -81,3 +81,12 @@ pub fn spread(context: &ComputeContext, count: usize, work: &(dyn Fn(usize) + Sy
         Error::result_from_status(status)
     }
 }
+
+/// [`spread`] where that pays, else one after the other.
+pub fn spread_if(pays: bool, context: &ComputeContext, count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<()> {
+    if pays {
+        return spread(context, count, work);
+    }
+    (0..count).for_each(work);
+    Ok(())
+}

@@ -16,7 +16,7 @@ use super::{
     bands::{Band, Bands},
     convolutions::Spread,
     lanes::{Lanes, Unit, Work},
-    operators::{input, output, spread},
+    operators::{input, output, spread_if},
 };
 
 const NAME: &str = "Resized";
@@ -257,11 +257,7 @@ impl Kernel for Node {
             *map = Some(Map { from, to, gain: *gain });
         }
         resize(self.rule, size.unwrap_or_default(), &mut maps, &|count: usize, work: &(dyn Fn(usize) + Sync)| {
-            if values < VALUES_SPREAD_MIN {
-                (0..count).for_each(work);
-                return Ok(());
-            }
-            spread(context, count, work)
+            spread_if(values >= VALUES_SPREAD_MIN, context, count, work)
         })
     }
 }

@@ -11,7 +11,7 @@ use ort::{
 use super::{CONVOLUTIONS, Chain, Encoder, Layer, Narrow, Step, Unit, View, Weights, Wide, chain, encoder};
 use crate::flow::{
     onnx_shared,
-    operators::{input, output, spread},
+    operators::{input, output, spread_if},
     winograd,
 };
 
@@ -175,15 +175,6 @@ fn size(lengths: &[i64]) -> Option<[usize; 2]> {
     Some([usize::try_from(height).ok()?, usize::try_from(width).ok()?])
 }
 
-/// Calls every piece of work, on the session's threads where that pays.
-fn shared(context: &ComputeContext, pays: bool, count: usize, work: &(dyn Fn(usize) + Sync)) -> Result<()> {
-    if !pays {
-        (0..count).for_each(work);
-        return Ok(());
-    }
-    spread(context, count, work)
-}
-
 impl Kernel for ChainNode {
     fn compute(&mut self, context: &ComputeContext) -> Result<()> {
         let (first, lengths) = input(context, CHAIN, 0)?;
@@ -211,7 +202,7 @@ impl Kernel for ChainNode {
             Work::Sixteen(_) => CELLS_SPREAD_MIN,
             Work::ThirtyTwo(_) => CELLS_SPREAD_MIN_WIDE,
         };
-        let spread = |count: usize, work: &(dyn Fn(usize) + Sync)| shared(context, cells >= least, count, work);
+        let spread = |count: usize, work: &(dyn Fn(usize) + Sync)| spread_if(cells >= least, context, count, work);
         let parts = &parts[..self.parts];
         match &mut self.work {
             Work::Sixteen(chain) => chain.run(parts, [height, width], last, before, &spread),
@@ -286,7 +277,7 @@ impl Kernel for EncoderNode {
         let eighth = output(context, 1, of(channels[1], 8))?;
         let projected = output(context, 2, of(channels[2], 8))?;
         let spread = |count: usize, work: &(dyn Fn(usize) + Sync)| {
-            shared(context, height * width >= CELLS_SPREAD_MIN, count, work)
+            spread_if(height * width >= CELLS_SPREAD_MIN, context, count, work)
         };
         let to = [quarter, eighth, projected];
         match &mut self.work {

@@ -8,7 +8,7 @@ use ort::{
     value::TensorElementType,
 };
 
-use crate::flow::operators::{input, output, spread};
+use crate::flow::operators::{input, output, spread_if};
 
 use super::{CostVolume, Inputs, Outputs, REACH_MAX, Shape, Unfit};
 
@@ -121,11 +121,7 @@ impl Kernel for Node {
         }
         let products = shape.cells().saturating_mul(channels).saturating_mul(shape.displacements());
         self.work.compute(shape, &inputs, Outputs { volume, argmax }, |count, work| {
-            if products < PRODUCTS_SPREAD_MIN {
-                (0..count).for_each(work);
-                return Ok(());
-            }
-            spread(context, count, work)
+            spread_if(products >= PRODUCTS_SPREAD_MIN, context, count, work)
         })
     }
 }
