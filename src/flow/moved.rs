@@ -16,7 +16,7 @@ use super::{
     bands::{Band, Bands},
     convolutions::Spread,
     lanes::{self, Lanes, MOST, Unit, Work},
-    operators::{input, output, spread_if},
+    operators::{input, output, refusal, spread_if},
 };
 
 const NAME: &str = "Moved";
@@ -122,11 +122,7 @@ fn sigmoid<L: Lanes>(lanes: L, x: L::V) -> L::V {
     lanes.div(of_negative, lanes.add(of_negative, of_positive))
 }
 
-impl From<Unfit> for Error {
-    fn from(unfit: Unfit) -> Self {
-        Error::new(unfit.to_string())
-    }
-}
+refusal!(Unfit);
 
 /// `nightflow::Moved(flow [1, 2, H, W], predicted [1, 3, H, W], argmax [1, 2, H, W])`, which gives flow [1, 2, H, W].
 pub struct Moved;
@@ -189,12 +185,6 @@ mod tests {
         convolutions::tests::{backwards, shared},
         cost_volume::tests::noise,
     };
-
-    impl From<Unfit> for Infallible {
-        fn from(unfit: Unfit) -> Self {
-            panic!("{unfit}")
-        }
-    }
 
     fn moved(unit: Unit, flow: &[f32], predicted: &[f32], argmax: &[f32]) -> Vec<f32> {
         let inputs = Inputs { flow, predicted, argmax };

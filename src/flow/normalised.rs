@@ -20,7 +20,7 @@ use super::{
     bands::{Band, Bands},
     convolutions::Spread,
     lanes::{Lanes, Unit, Work},
-    operators::{input, output, spread},
+    operators::{input, output, refusal, spread},
 };
 
 const NAME: &str = "Normalised";
@@ -163,11 +163,7 @@ impl Work for Pixels<'_> {
     }
 }
 
-impl From<Unfit> for Error {
-    fn from(unfit: Unfit) -> Self {
-        Error::new(unfit.to_string())
-    }
-}
+refusal!(Unfit);
 
 /// `nightflow::Normalised(features [1, C, H, W])`, of the same shape.
 pub struct Normalise;
@@ -221,12 +217,6 @@ mod tests {
         convolutions::tests::{backwards, shared},
         cost_volume::tests::noise,
     };
-
-    impl From<Unfit> for Infallible {
-        fn from(unfit: Unfit) -> Self {
-            panic!("{unfit}")
-        }
-    }
 
     /// As the definition says, in 64 bits.
     fn defined(from: &[f32], [channels, height, width]: [usize; 3]) -> Vec<f64> {

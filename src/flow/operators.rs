@@ -20,6 +20,25 @@ pub fn domain() -> Result<OperatorDomain> {
     domain.add(resized::Resized)?.add(moved::Moved)
 }
 
+/// What an operator refuses is an error of ONNX Runtime's; in tests of what fits there is none.
+macro_rules! refusal {
+    ($unfit:ty) => {
+        impl From<$unfit> for ort::Error {
+            fn from(unfit: $unfit) -> Self {
+                Self::new(unfit.to_string())
+            }
+        }
+
+        #[cfg(test)]
+        impl From<$unfit> for std::convert::Infallible {
+            fn from(unfit: $unfit) -> Self {
+                panic!("{unfit}")
+            }
+        }
+    };
+}
+pub(super) use refusal;
+
 /// An input's values and lengths. Neither takes memory, which `ComputeContext::input` does.
 pub fn input<'a>(context: &'a ComputeContext, operator: &str, index: usize) -> Result<(&'a [f32], &'a [i64])> {
     let api = ort::api();

@@ -85,7 +85,7 @@ impl Moving {
         Ok(Self { left, large, moved, refused: None })
     }
 
-    /// Moves a piece, which takes some milliseconds at most; whether there are more. Nothing in it changes.
+    /// Moves a piece, which takes one to nine milliseconds, or none where it lies there already; whether there are more. Nothing in it changes.
     pub fn step(&mut self) -> bool {
         if let Some(first) = self.left.pop() {
             match ask(first, self.large) {

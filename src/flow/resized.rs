@@ -16,7 +16,7 @@ use super::{
     bands::{Band, Bands},
     convolutions::Spread,
     lanes::{Lanes, Unit, Work},
-    operators::{input, output, spread_if},
+    operators::{input, output, refusal, spread_if},
 };
 
 const NAME: &str = "Resized";
@@ -186,11 +186,7 @@ fn fill([upper, lower]: [&[f32]; 2], gain: f32, to: &mut [f32]) {
     to[2 * last..].fill(gain * mean(upper[last], lower[last]));
 }
 
-impl From<Unfit> for Error {
-    fn from(unfit: Unfit) -> Self {
-        Error::new(unfit.to_string())
-    }
-}
+refusal!(Unfit);
 
 /// `nightflow::Resized(values [1, C, H, W] …)`, at most [`MAPS_MAX`] of them and as many outputs. Attributes: the `rule`, and a number
 /// of `gains` for each, what it is multiplied with.
@@ -273,12 +269,6 @@ mod tests {
         convolutions::tests::{backwards, shared},
         cost_volume::tests::noise,
     };
-
-    impl From<Unfit> for Infallible {
-        fn from(unfit: Unfit) -> Self {
-            panic!("{unfit}")
-        }
-    }
 
     /// What a cell of a row or column is made of by the rule, and what each of those weighs.
     fn defined(rule: Rule, at: usize, length: usize) -> [(usize, f64); 2] {

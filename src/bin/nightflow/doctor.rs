@@ -128,6 +128,11 @@ fn network(config: &Config) -> Vec<(&'static str, Finding)> {
         Err(error) => Finding::Do(error.to_string()),
     };
     let mut ours = Ours::with(matcher, ours::frames(SIZE[0], SIZE[1]));
+    // The first step takes all memory, which then moves at once: the node moves it bit by bit, beside its steps.
+    let (pages, speed) = match ours.step() {
+        Ok(_) => (memory_pages(&config.flow), speed(&mut ours, may_be_faster(&config.flow))),
+        Err(error) => (Finding::Warning("no step was made".into()), Finding::Do(error.to_string())),
+    };
     vec![
         ("runtime", Finding::Ok(format!("{}, {}", model.provider, model.library.display()))),
         (
@@ -141,8 +146,8 @@ fn network(config: &Config) -> Vec<(&'static str, Finding)> {
             )),
         ),
         ("golden output", golden),
-        ("speed", speed(&mut ours, may_be_faster(&config.flow))),
-        ("memory pages", memory_pages(&config.flow)),
+        ("memory pages", pages),
+        ("speed", speed),
     ]
 }
 
@@ -158,14 +163,12 @@ fn may_be_faster(flow: &flow::Config) -> bool {
 /// The median of five steps at the network's usual size, each with one new frame, as in a running node.
 fn speed(ours: &mut Ours, may_be_faster: bool) -> Finding {
     let mut took = Vec::new();
-    for _ in 0..6 {
+    for _ in 0..5 {
         match ours.step() {
             Ok(ms) => took.push(ms),
             Err(error) => return Finding::Do(error.to_string()),
         }
     }
-    // The first step also warms the runtime up.
-    took.remove(0);
     took.sort_by(f64::total_cmp);
     let median = took[took.len() / 2];
     let [width, height] = SIZE;

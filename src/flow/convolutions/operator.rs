@@ -11,7 +11,7 @@ use ort::{
 use super::{CONVOLUTIONS, Chain, Encoder, Layer, Narrow, Step, Unit, View, Weights, Wide, chain, encoder};
 use crate::flow::{
     onnx_shared,
-    operators::{input, output, spread_if},
+    operators::{input, output, refusal, spread_if},
     winograd,
 };
 
@@ -25,17 +25,8 @@ const PARTS_MAX: usize = 8;
 /// The farthest apart that weights may lie.
 const DILATION_MAX: i64 = 64;
 
-impl From<chain::Unfit> for Error {
-    fn from(unfit: chain::Unfit) -> Self {
-        Error::new(unfit.to_string())
-    }
-}
-
-impl From<encoder::Unfit> for Error {
-    fn from(unfit: encoder::Unfit) -> Self {
-        Error::new(unfit.to_string())
-    }
-}
+refusal!(chain::Unfit);
+refusal!(encoder::Unfit);
 
 /// `nightflow::Convolutions(part [1, C, H, W] …, weight [O, I, K, K], bias [O] …)`: the parts are read as if they were
 /// concatenated; each weight and bias is a layer that keeps the size. Attributes: how many `parts`, and for each layer one of

@@ -6,23 +6,11 @@ use proptest::prelude::*;
 use rayon::prelude::*;
 
 use super::{
-    encoder::{Numbers, Unfit},
+    encoder::Numbers,
     tiles::{narrowed, widened},
     *,
 };
 use crate::flow::{cost_volume::tests::noise, winograd};
-
-impl From<Unfit> for Infallible {
-    fn from(unfit: Unfit) -> Self {
-        panic!("{unfit}")
-    }
-}
-
-impl From<chain::Unfit> for Infallible {
-    fn from(unfit: chain::Unfit) -> Self {
-        panic!("{unfit}")
-    }
-}
 
 /// How numbers are rounded.
 type Round = fn(f64) -> f64;

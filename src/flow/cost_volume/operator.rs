@@ -8,7 +8,7 @@ use ort::{
     value::TensorElementType,
 };
 
-use crate::flow::operators::{input, output, spread_if};
+use crate::flow::operators::{input, output, refusal, spread_if};
 
 use super::{CostVolume, Inputs, Outputs, REACH_MAX, Shape, Unfit};
 
@@ -31,11 +31,7 @@ pub struct Node {
     work: CostVolume,
 }
 
-impl From<Unfit> for Error {
-    fn from(unfit: Unfit) -> Self {
-        Error::new(unfit.to_string())
-    }
-}
+refusal!(Unfit);
 
 /// A flow from a cell of so many in a row or column, with the digits that a grid of −1…1 leaves it.
 ///

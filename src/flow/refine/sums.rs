@@ -55,6 +55,7 @@ pub(super) struct Warp {
     valid: Vec<f32>,
     /// Where each pixel of the older frame stands in the newer one, x then y.
     places: [Vec<f32>; 2],
+    /// How those of a row are read, [`SIDE_BY_SIDE`] together.
     reads: Vec<Reads>,
     /// Vectors of a row of cells, with one more at either end.
     line: [Vec<f32>; 2],
@@ -79,7 +80,7 @@ impl Warp {
         let pixels = (CELL * raster[0]).next_multiple_of(SIDE_BY_SIDE);
         self.places.iter_mut().for_each(|places| places.resize(pixels, 0.0));
         self.line.iter_mut().for_each(|line| line.resize(raster[0] + 2, 0.0));
-        self.reads.resize((CELL * raster[0]).div_ceil(SIDE_BY_SIDE), Reads::default());
+        self.reads.resize(pixels / SIDE_BY_SIDE, Reads::default());
         self.valid.fill(0.0);
         let covered = CELL * raster[0];
         let marks = |exposed: &'_ Exposed| exposed.saturated_part > 0.0;
