@@ -25,7 +25,7 @@ use crate::{
     clock::Stamp,
     exposure::{Exposed, Pair},
 };
-use pyramid::{Level, Sums};
+use pyramid::{Found, Level, Sums};
 
 /// Pixels of the developed image in a cell, along either side.
 const CELL: usize = 4;
@@ -34,6 +34,8 @@ const SIDE_MIN: usize = 16;
 const ROUNDS: usize = 2;
 /// The variance that a pixel's value has beyond what is known of its noise: half a step of eight bits, squared.
 const FLOOR: f32 = 3.84e-6;
+/// Pixels or cells that are worked on at once.
+const SIDE_BY_SIDE: usize = 16;
 /// An expected end-point error on either axis: a vector of two normal errors of deviation s has a mean length of 1.25 s.
 const AXIS: f32 = 0.8;
 /// No vector is known better beforehand than this, pixels.
@@ -47,13 +49,12 @@ pub(super) struct Refiner {
     /// The newest two frames' grey.
     seen: [Grey; 2],
     scratch: Vec<f32>,
-    /// The network's vectors in pixels and what is added to them: cells × 2.
-    start: Vec<f32>,
-    change: Vec<f32>,
+    /// The network's vectors in pixels, right and down.
+    start: [Vec<f32>; 2],
+    /// What is added to them.
+    found: Found,
     /// Deviation of the network's vectors beforehand, on either axis, pixels.
     prior: Vec<f32>,
-    /// Half of the trace of the covariance afterwards, pixels².
-    variance: Vec<f32>,
     /// Mean squared difference of the frames in each window before the first round.
     before: Vec<f32>,
     warp: sums::Warp,
@@ -112,23 +113,23 @@ impl Refiner {
         self.begin(raster, columns, pair.older.scale, flow, uncertainty);
         let [older, newer] = &self.seen;
         for round in 0..ROUNDS {
-            self.warp.bring(pair, [&older.values, &newer.values], raster, &self.start, &self.change);
+            self.warp.bring(pair, [&older.values, &newer.values], raster, &self.start, &self.found.change);
             let noise = [older.slope + newer.slope, older.base + newer.base];
             self.warp.sum(&older.values, size, noise, &mut self.cells);
-            pyramid::centre(&mut self.cells, &self.change, &self.prior);
+            pyramid::centre(&mut self.cells, &self.found.change, &self.prior);
             pyramid::smooth(&self.cells, &mut self.window);
             if round == 0 {
                 self.before.clear();
                 self.before.extend(self.window.misfits());
             } else {
-                withdraw(&self.window, &mut self.before, &mut self.change);
+                withdraw(&self.window, &mut self.before, &mut self.found.change);
             }
             pyramid::halve(&self.cells, &mut self.levels);
             let columns = self.narrow.then(|| {
                 pyramid::stand(&self.cells, &mut self.column);
                 &self.column
             });
-            pyramid::descend(&mut self.levels, &self.window, columns, &mut self.change, &mut self.variance);
+            pyramid::descend(&mut self.levels, &self.window, columns, &mut self.found);
         }
         self.conclude(raster, columns, pair.older.scale, flow, uncertainty);
     }
@@ -150,18 +151,17 @@ impl Refiner {
     }
 
     fn begin(&mut self, [width, height]: [usize; 2], columns: usize, scale: [f32; 2], flow: &[f32], errors: &[f32]) {
-        self.start.clear();
+        self.start.iter_mut().for_each(Vec::clear);
         self.prior.clear();
         let rows = flow.chunks_exact(2 * columns).zip(errors.chunks_exact(columns)).take(height);
         for (vectors, errors) in rows {
-            let pixels = vectors.as_chunks::<2>().0[..width].iter().flat_map(|[u, v]| [u / scale[0], v / scale[1]]);
-            self.start.extend(pixels);
+            let vectors = &vectors.as_chunks::<2>().0[..width];
+            for (axis, start) in self.start.iter_mut().enumerate() {
+                start.extend(vectors.iter().map(|vector| vector[axis] / scale[axis]));
+            }
             self.prior.extend(errors[..width].iter().map(|error| (AXIS * error).max(PRIOR_MIN)));
         }
-        self.change.clear();
-        self.change.resize(2 * width * height, 0.0);
-        self.variance.clear();
-        self.variance.resize(width * height, 0.0);
+        self.found.begin(width * height);
     }
 
     fn conclude(
@@ -177,24 +177,48 @@ impl Refiner {
             let vectors = vectors.as_chunks_mut::<2>().0[..width].iter_mut();
             for (column, (vector, error)) in vectors.zip(errors).enumerate() {
                 let cell = row * width + column;
-                if self.before[cell] < 0.0 || self.variance[cell] <= 0.0 {
+                let variance = self.found.variance[cell];
+                if self.before[cell] < 0.0 || variance <= 0.0 {
                     continue;
                 }
-                vector[0] += self.change[2 * cell] * scale[0];
-                vector[1] += self.change[2 * cell + 1] * scale[1];
-                *error = error.min((self.variance[cell].sqrt() / AXIS).max(ERROR_MIN));
+                for (axis, change) in self.found.change.iter().enumerate() {
+                    vector[axis] += change[cell] * scale[axis];
+                }
+                *error = error.min((variance.sqrt() / AXIS).max(ERROR_MIN));
             }
         }
     }
 }
 
 /// Cells that the first round did not make more alike go back to where they were, and stay there.
-fn withdraw(window: &Sums, before: &mut [f32], change: &mut [f32]) {
-    for ((after, before), change) in window.misfits().zip(before).zip(change.as_chunks_mut::<2>().0) {
+fn withdraw(window: &Sums, before: &mut [f32], [right, down]: &mut [Vec<f32>; 2]) {
+    let changes = right.iter_mut().zip(down);
+    for ((after, before), (right, down)) in window.misfits().zip(before).zip(changes) {
         // Asked this way round, a NaN goes back too.
         let better = after <= *before;
         if !better {
-            (*change, *before) = ([0.0; 2], f32::NEG_INFINITY);
+            (*right, *down, *before) = (0.0, 0.0, f32::NEG_INFINITY);
         }
+    }
+}
+
+/// Some values from a place on, zeros behind the last.
+#[inline(always)]
+fn some(plane: &[f32], at: usize) -> [f32; SIDE_BY_SIDE] {
+    let rest = &plane[at..];
+    rest.first_chunk().copied().unwrap_or_else(|| {
+        let mut values = [0.0; SIDE_BY_SIDE];
+        values[..rest.len()].copy_from_slice(rest);
+        values
+    })
+}
+
+/// The other way; what is behind the last is dropped.
+#[inline(always)]
+fn put(values: [f32; SIDE_BY_SIDE], plane: &mut [f32], at: usize) {
+    let rest = &mut plane[at..];
+    match rest.first_chunk_mut() {
+        Some(all) => *all = values,
+        None => rest.copy_from_slice(&values[..rest.len()]),
     }
 }

@@ -1,6 +1,10 @@
 //! Windows over the cells' sums, and the correction from the largest window down to each cell.
+//!
+//! As in [`sums`](super::sums), all instruction sets give the same bits.
 
-use super::CELL;
+use multiversion::multiversion;
+
+use super::{CELL, SIDE_BY_SIDE, put, some};
 
 /// Windows beyond the cell's own, each twice as wide as the one before.
 const LEVELS: usize = 5;
@@ -29,15 +33,8 @@ pub(super) struct Sums {
     line: Vec<f32>,
 }
 
-const XX: usize = 0;
-const XY: usize = 1;
-const YY: usize = 2;
-const X: usize = 3;
-const Y: usize = 4;
 const MISFIT: usize = 5;
-const NOISE: usize = 6;
 const COUNT: usize = 7;
-const BELIEF: usize = 8;
 
 impl Sums {
     pub(super) const PLANES: usize = 9;
@@ -57,16 +54,8 @@ impl Sums {
     pub(super) fn fold(&mut self, row: usize, products: &[f32]) {
         let (width, cells) = (self.width, self.cells());
         for (plane, products) in products.chunks_exact(CELL * width).enumerate() {
-            let out = &mut self.planes[plane * cells + row * width..][..width];
-            for (sum, four) in out.iter_mut().zip(products.as_chunks::<CELL>().0) {
-                *sum = (four[0] + four[1]) + (four[2] + four[3]);
-            }
+            add_fours(products, &mut self.planes[plane * cells + row * width..][..width]);
         }
-    }
-
-    fn at(&self, cell: usize) -> [f32; Self::PLANES] {
-        let cells = self.cells();
-        std::array::from_fn(|plane| self.planes[plane * cells + cell])
     }
 
     /// Mean squared difference over what noise lets expect, cell by cell; NaN where there is none.
@@ -76,20 +65,65 @@ impl Sums {
     }
 }
 
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn add_fours(products: &[f32], sums: &mut [f32]) {
+    for (sum, four) in sums.iter_mut().zip(products.as_chunks::<CELL>().0) {
+        *sum = (four[0] + four[1]) + (four[2] + four[3]);
+    }
+}
+
+/// Corrections of cells, pixels right and down, and what variance they have on either axis, pixels².
+#[derive(Debug, Default)]
+pub(super) struct Found {
+    pub(super) change: [Vec<f32>; 2],
+    pub(super) variance: Vec<f32>,
+}
+
+impl Found {
+    /// None, for so many cells.
+    pub(super) fn begin(&mut self, cells: usize) {
+        for plane in self.planes_mut() {
+            plane.clear();
+            plane.resize(cells, 0.0);
+        }
+    }
+
+    fn planes(&self) -> [&Vec<f32>; 3] {
+        [&self.change[0], &self.change[1], &self.variance]
+    }
+
+    fn planes_mut(&mut self) -> [&mut Vec<f32>; 3] {
+        let [right, down] = &mut self.change;
+        [right, down, &mut self.variance]
+    }
+}
+
 /// Takes the noise off the gradients' products, and makes of gradients times differences what the whole correction should
 /// be, that so far included, times the information.
-pub(super) fn centre(sums: &mut Sums, change: &[f32], prior: &[f32]) {
-    let cells = sums.cells();
-    for cell in 0..cells {
-        let sum = sums.at(cell);
-        let (xx, xy, yy) = (sum[XX] - sum[NOISE], sum[XY], sum[YY] - sum[NOISE]);
-        let [u, v] = [change[2 * cell], change[2 * cell + 1]];
-        let mut set = |plane: usize, value: f32| sums.planes[plane * cells + cell] = value;
-        set(XX, xx);
-        set(YY, yy);
-        set(X, sum[X] + (xx * u + xy * v));
-        set(Y, sum[Y] + (xy * u + yy * v));
-        set(BELIEF, sum[COUNT] / (prior[cell] * prior[cell]));
+pub(super) fn centre(sums: &mut Sums, change: &[Vec<f32>; 2], prior: &[f32]) {
+    let mut planes = sums.planes.chunks_exact_mut(prior.len());
+    centre_planes(std::array::from_fn(|_| planes.next().unwrap_or_default()), [&change[0], &change[1]], prior);
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn centre_planes(sums: [&mut [f32]; Sums::PLANES], [u, v]: [&[f32]; 2], prior: &[f32]) {
+    let [xx, xy, yy, x, y, _, noise, count, belief] = sums;
+    for at in (0..prior.len()).step_by(SIDE_BY_SIDE) {
+        let [mut to_xx, of_xy, mut to_yy] = [some(xx, at), some(xy, at), some(yy, at)];
+        let [mut to_x, mut to_y, mut to_belief] = [some(x, at), some(y, at), some(prior, at)];
+        let [noise, count, u, v] = [some(noise, at), some(count, at), some(u, at), some(v, at)];
+        for i in 0..SIDE_BY_SIDE {
+            to_xx[i] -= noise[i];
+            to_yy[i] -= noise[i];
+            to_x[i] += to_xx[i] * u[i] + of_xy[i] * v[i];
+            to_y[i] += of_xy[i] * u[i] + to_yy[i] * v[i];
+            to_belief[i] = count[i] / (to_belief[i] * to_belief[i]);
+        }
+        put(to_xx, xx, at);
+        put(to_yy, yy, at);
+        put(to_x, x, at);
+        put(to_y, y, at);
+        put(to_belief, belief, at);
     }
 }
 
@@ -97,23 +131,28 @@ pub(super) fn centre(sums: &mut Sums, change: &[f32], prior: &[f32]) {
 pub(super) fn smooth(from: &Sums, into: &mut Sums) {
     let (width, height) = (from.width, from.height);
     into.size([width, height]);
-    into.line.resize(width, 0.0);
+    into.line.resize(width + 4, 0.0);
     let Sums { planes, line, .. } = into;
     let both = from.planes.chunks_exact(width * height).zip(planes.chunks_exact_mut(width * height));
-    for (from, into) in both {
-        for (y, out) in into.chunks_exact_mut(width).enumerate() {
-            let row = |off: isize| {
-                let y = (y as isize + off).clamp(0, height as isize - 1) as usize;
-                &from[y * width..][..width]
-            };
-            let (up2, up, here, down, down2) = (row(-2), row(-1), row(0), row(1), row(2));
-            for (x, value) in line.iter_mut().enumerate() {
-                *value = (up2[x] + down2[x]) * (1.0 / 6.0) + (up[x] + down[x]) * (4.0 / 6.0) + here[x];
-            }
-            for (x, value) in out.iter_mut().enumerate() {
-                let at = |off: isize| line[(x as isize + off).clamp(0, width as isize - 1) as usize];
-                *value = (at(-2) + at(2)) * (1.0 / 6.0) + (at(-1) + at(1)) * (4.0 / 6.0) + at(0);
-            }
+    both.for_each(|(from, into)| smooth_plane(from, width, line, into));
+}
+
+/// `line` has room for two columns more on either side.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn smooth_plane(from: &[f32], width: usize, line: &mut [f32], into: &mut [f32]) {
+    let last = from.len() / width - 1;
+    for (y, out) in into.chunks_exact_mut(width).enumerate() {
+        let row = |y: usize| &from[y.min(last) * width..][..width];
+        let (up2, up, here) = (row(y.saturating_sub(2)), row(y.saturating_sub(1)), row(y));
+        let (down, down2) = (row(y + 1), row(y + 2));
+        for (x, value) in line[2..][..width].iter_mut().enumerate() {
+            *value = (up2[x] + down2[x]) * (1.0 / 6.0) + (up[x] + down[x]) * (4.0 / 6.0) + here[x];
+        }
+        let (first, end) = (line[2], line[width + 1]);
+        line[..2].fill(first);
+        line[width + 2..].fill(end);
+        for (value, five) in out.iter_mut().zip(line.windows(5)) {
+            *value = (five[0] + five[4]) * (1.0 / 6.0) + (five[1] + five[3]) * (4.0 / 6.0) + five[2];
         }
     }
 }
@@ -124,16 +163,20 @@ pub(super) fn stand(from: &Sums, into: &mut Sums) {
     let (width, height) = (from.width, from.height);
     into.size([width, height]);
     let both = from.planes.chunks_exact(width * height).zip(into.planes.chunks_exact_mut(width * height));
-    for (from, into) in both {
-        for (y, out) in into.chunks_exact_mut(width).enumerate() {
-            let row = |y: usize| &from[y.min(height - 1) * width..][..width];
-            for (value, here) in out.iter_mut().zip(row(y)) {
-                *value = COLUMN[0] * here;
-            }
-            for (off, weight) in COLUMN.iter().enumerate().skip(1) {
-                for (value, (up, down)) in out.iter_mut().zip(row(y.saturating_sub(off)).iter().zip(row(y + off))) {
-                    *value += weight * (up + down);
-                }
+    both.for_each(|(from, into)| stand_plane(from, width, into));
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn stand_plane(from: &[f32], width: usize, into: &mut [f32]) {
+    let last = from.len() / width - 1;
+    for (y, out) in into.chunks_exact_mut(width).enumerate() {
+        let row = |y: usize| &from[y.min(last) * width..][..width];
+        for (value, here) in out.iter_mut().zip(row(y)) {
+            *value = COLUMN[0] * here;
+        }
+        for (off, weight) in COLUMN.iter().enumerate().skip(1) {
+            for (value, (up, down)) in out.iter_mut().zip(row(y.saturating_sub(off)).iter().zip(row(y + off))) {
+                *value += weight * (up + down);
             }
         }
     }
@@ -143,8 +186,7 @@ pub(super) fn stand(from: &Sums, into: &mut Sums) {
 #[derive(Debug, Default)]
 pub(super) struct Level {
     sums: Sums,
-    change: Vec<f32>,
-    variance: Vec<f32>,
+    found: Found,
 }
 
 /// The larger windows: (1 3 3 1)/4 along rows and columns of the level before, every second one. Every cell counts once
@@ -156,134 +198,209 @@ pub(super) fn halve(cells: &Sums, levels: &mut Vec<Level>) {
     while let Some((level, others)) = rest.split_first_mut() {
         let (width, height) = (from.width.div_ceil(2), from.height.div_ceil(2));
         level.sums.size([width, height]);
-        level.change.resize(2 * width * height, 0.0);
-        level.variance.resize(width * height, 0.0);
+        level.found.begin(width * height);
         let Sums { planes, line, .. } = &mut level.sums;
-        line.resize(from.width, 0.0);
+        line.clear();
+        line.resize(2 * width + 2, 0.0);
         let both = from.planes.chunks_exact(from.cells()).zip(planes.chunks_exact_mut(width * height));
-        for (from_plane, into) in both {
-            for (y, out) in into.chunks_exact_mut(width).enumerate() {
-                line.fill(0.0);
-                for (off, weight) in [0.25, 0.75, 0.75, 0.25].into_iter().enumerate() {
-                    let Some(y) = (2 * y + off).checked_sub(1).filter(|y| *y < from.height) else { continue };
-                    for (value, sum) in line.iter_mut().zip(&from_plane[y * from.width..][..from.width]) {
-                        *value += weight * sum;
-                    }
-                }
-                for (x, value) in out.iter_mut().enumerate() {
-                    let at =
-                        |off: usize| (2 * x + off).checked_sub(1).and_then(|x| line.get(x)).copied().unwrap_or(0.0);
-                    *value = 0.25 * (at(0) + at(3)) + 0.75 * (at(1) + at(2));
-                }
-            }
-        }
+        both.for_each(|(plane, into)| halve_plane(plane, from.width, line, into));
         from = &level.sums;
         rest = others;
     }
 }
 
+/// `line` has room for a column more on the left, and for so many on the right that its length is even and a larger column's four lie
+/// in it; these stay zero.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn halve_plane(from: &[f32], width: usize, line: &mut [f32], into: &mut [f32]) {
+    for (y, out) in into.chunks_exact_mut(width.div_ceil(2)).enumerate() {
+        line[1..][..width].fill(0.0);
+        for (off, weight) in [0.25, 0.75, 0.75, 0.25].into_iter().enumerate() {
+            let Some(y) = (2 * y + off).checked_sub(1).filter(|y| (y + 1) * width <= from.len()) else { continue };
+            for (value, sum) in line[1..].iter_mut().zip(&from[y * width..][..width]) {
+                *value += weight * sum;
+            }
+        }
+        for (value, pairs) in out.iter_mut().zip(line.as_chunks::<2>().0.windows(2)) {
+            *value = 0.25 * (pairs[0][0] + pairs[1][1]) + 0.75 * (pairs[0][1] + pairs[1][0]);
+        }
+    }
+}
+
 /// From the largest window, which believes the network, down to the cells' own, and on to their columns where there are any.
-pub(super) fn descend(
-    levels: &mut [Level],
-    cells: &Sums,
-    columns: Option<&Sums>,
-    change: &mut [f32],
-    variance: &mut [f32],
-) {
+pub(super) fn descend(levels: &mut [Level], cells: &Sums, columns: Option<&Sums>, found: &mut Found) {
     for at in (0..levels.len()).rev() {
         let (below, above) = levels.split_at_mut(at + 1);
-        if let Some(Level { sums, change, variance }) = below.last_mut() {
+        if let Some(Level { sums, found }) = below.last_mut() {
             match above.first() {
-                Some(larger) => settle(sums, LOCAL, |cell, _| larger.around(cell, sums), change, variance),
-                None => settle(sums, TOP, |_, _| Known::default(), change, variance),
+                Some(larger) => {
+                    larger.widen(sums, found);
+                    settle(sums, LOCAL, found);
+                }
+                None => {
+                    found.begin(sums.cells());
+                    settle(sums, TOP, found);
+                }
             }
         }
     }
     if let Some(larger) = levels.first() {
-        settle(cells, LOCAL, |cell, _| larger.around(cell, cells), change, variance);
+        larger.widen(cells, found);
+        settle(cells, LOCAL, found);
     }
     if let Some(columns) = columns {
-        settle(columns, LOCAL, |_, window| window, change, variance);
+        settle(columns, LOCAL, found);
     }
-}
-
-/// A correction, and its variance.
-type Known = ([f32; 2], f32);
-
-/// The correction of each window by its own sums and by what is known beforehand, given the cell and what was here.
-fn settle(
-    sums: &Sums,
-    part: f32,
-    beforehand: impl Fn(usize, Known) -> Known,
-    change: &mut [f32],
-    variance: &mut [f32],
-) {
-    let both = change.as_chunks_mut::<2>().0.iter_mut().zip(variance);
-    for (cell, (change, variance)) in both.enumerate() {
-        let (before, unsure) = beforehand(cell, (*change, *variance));
-        let sum = sums.at(cell);
-        if sum[COUNT] <= 0.0 {
-            (*change, *variance) = (before, UNKNOWN);
-            continue;
-        }
-        let (found, spread) = posterior(&sum, before, unsure, sum[BELIEF] / sum[COUNT] / (part * part));
-        let length = (found[0] * found[0] + found[1] * found[1]).sqrt();
-        // Asked this way round, a NaN changes nothing.
-        if length <= REACH {
-            *change = found;
-        } else if length.is_finite() {
-            *change = found.map(|along| along * (REACH / length));
-        }
-        *variance = spread;
-    }
-}
-
-/// Mean and half of the covariance's trace, where the window's correction is known beforehand to be `before` with the
-/// inverse variance `belief`, and `before` itself has the variance `unsure`.
-///
-/// Gradients are believed as far as the truth is likely to be near. Where the network states an error of many pixels, as in mere
-/// noise, what they say is chance, and makes much of the last digits of the vectors.
-fn posterior(sum: &[f32; Sums::PLANES], before: [f32; 2], unsure: f32, belief: f32) -> Known {
-    let near = 1.0 - (-0.5 * NEAR * NEAR * belief).exp();
-    // More difference than noise lets expect: moving things, light that changed, motion that is none. It weighs on all.
-    let trust = near / (sum[MISFIT] / sum[COUNT]).max(1.0);
-    let (middle, lean, skew) = (0.5 * (sum[XX] + sum[YY]), 0.5 * (sum[XX] - sum[YY]), sum[XY]);
-    let apart = (lean * lean + skew * skew).sqrt();
-    // The direction that is known best, by half its angle.
-    let (twice, sign) = if apart > 0.0 { (lean / apart, skew) } else { (1.0, 0.0) };
-    let cosine = (0.5 * (1.0 + twice)).max(0.0).sqrt();
-    let sine = (0.5 * (1.0 - twice)).max(0.0).sqrt() * if sign < 0.0 { -1.0 } else { 1.0 };
-    let turn = |[x, y]: [f32; 2]| [cosine * x + sine * y, cosine * y - sine * x];
-    let (pull, from) = (turn([sum[X], sum[Y]]), turn(before));
-    let (mut found, mut spread) = ([0.0; 2], 0.0);
-    for (axis, information) in [middle + apart, middle - apart].into_iter().enumerate() {
-        // Noise in the gradients meets noise in the difference, which gives pulls though nothing is known.
-        let trust = if information > 0.0 { trust * information / (information + sum[NOISE]) } else { 0.0 };
-        let (known, pull) = (information.max(0.0) * trust, pull[axis] * trust);
-        found[axis] = (pull + belief * from[axis]) / (known + belief);
-        let left = belief / (known + belief);
-        spread += 0.5 * (1.0 / (known + belief) + left * left * unsure);
-    }
-    ([cosine * found[0] - sine * found[1], sine * found[0] + cosine * found[1]], spread)
 }
 
 impl Level {
-    /// Correction and variance around a cell of the next smaller level, whose sums these are.
-    fn around(&self, cell: usize, smaller: &Sums) -> Known {
-        self.between(cell % smaller.width, cell / smaller.width)
+    /// What was found here, at the cells of the next smaller level: bilinear between the centres.
+    fn widen(&self, smaller: &Sums, into: &mut Found) {
+        let Sums { width, height, .. } = self.sums;
+        for (from, into) in self.found.planes().into_iter().zip(into.planes_mut()) {
+            for (y, out) in into.chunks_exact_mut(smaller.width).enumerate() {
+                let near = y / 2;
+                let far = if y.is_multiple_of(2) { near.saturating_sub(1) } else { (near + 1).min(height - 1) };
+                widen_row(&from[near * width..][..width], &from[far * width..][..width], out);
+            }
+        }
     }
+}
 
-    /// Correction and variance at the place of a cell of the next smaller level, bilinear between the centres.
-    fn between(&self, column: usize, row: usize) -> Known {
-        let near_and_far = |at: usize, count: usize| {
-            let near = at / 2;
-            [near, if at.is_multiple_of(2) { near.saturating_sub(1) } else { (near + 1).min(count - 1) }]
-        };
-        let (columns, rows) = (near_and_far(column, self.sums.width), near_and_far(row, self.sums.height));
-        let [a, b, c, d] = [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(x, y)| rows[y] * self.sums.width + columns[x]);
-        let mix =
-            |of: &dyn Fn(usize) -> f32| 0.75 * (0.75 * of(a) + 0.25 * of(b)) + 0.25 * (0.75 * of(c) + 0.25 * of(d));
-        let change = [mix(&|at| self.change[2 * at]), mix(&|at| self.change[2 * at + 1])];
-        (change, mix(&|at| self.variance[at]))
+/// Two columns for each one of the nearer row and the farther one; one for the last where there is no more room.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn widen_row(near: &[f32], far: &[f32], out: &mut [f32]) {
+    #[inline(always)]
+    fn mix(a: f32, b: f32, c: f32, d: f32) -> f32 {
+        0.75 * (0.75 * a + 0.25 * b) + 0.25 * (0.75 * c + 0.25 * d)
+    }
+    let last = near.len() - 1;
+    for x in [0, last] {
+        for (odd, beside) in [x.saturating_sub(1), (x + 1).min(last)].into_iter().enumerate() {
+            if let Some(out) = out.get_mut(2 * x + odd) {
+                *out = mix(near[x], near[beside], far[x], far[beside]);
+            }
+        }
+    }
+    let pairs = out.as_chunks_mut::<2>().0.iter_mut().skip(1);
+    for ((near, far), pair) in near.windows(3).zip(far.windows(3)).zip(pairs) {
+        *pair = [mix(near[1], near[0], far[1], far[0]), mix(near[1], near[2], far[1], far[2])];
+    }
+}
+
+/// The correction of each window by its own sums and by what is there, which is what is known beforehand.
+fn settle(sums: &Sums, part: f32, found: &mut Found) {
+    let mut planes = sums.planes.chunks_exact(sums.cells());
+    let [right, down, variance] = found.planes_mut();
+    settle_planes(
+        std::array::from_fn(|_| planes.next().unwrap_or_default()),
+        1.0 / (part * part),
+        [right, down, variance],
+    );
+}
+
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn settle_planes(sums: [&[f32]; Sums::PLANES], part: f32, [right, down, variance]: [&mut [f32]; 3]) {
+    let [xx, xy, yy, x, y, misfit, noise, count, belief] = sums;
+    for at in (0..variance.len()).step_by(SIDE_BY_SIDE) {
+        let (xx, xy, yy, x, y) = (some(xx, at), some(xy, at), some(yy, at), some(x, at), some(y, at));
+        let (misfit, noise, count, belief) = (some(misfit, at), some(noise, at), some(count, at), some(belief, at));
+        let (mut to_right, mut to_down, mut to_variance) = (some(right, at), some(down, at), some(variance, at));
+        for i in 0..SIDE_BY_SIDE {
+            let before = Told { right: to_right[i], down: to_down[i], variance: to_variance[i] };
+            let belief = belief[i] / count[i] * part;
+            // Gradients are believed as far as the truth is likely to be near. Where the network states an error of many pixels,
+            // as in mere noise, what they say is chance, and makes much of the last digits of the vectors.
+            let near = 1.0 - fading(0.5 * NEAR * NEAR * belief);
+            // More difference than noise lets expect: moving things, light that changed, motion that is none. It weighs on
+            // all.
+            let trust = near / (misfit[i] / count[i]).max(1.0);
+            let told = posterior([xx[i], xy[i], yy[i]], [x[i], y[i]], noise[i], trust, belief, before);
+            let length = (told.right * told.right + told.down * told.down).sqrt();
+            let shorter = if length > REACH { REACH / length } else { 1.0 };
+            // Where nothing was seen, and where what was seen makes no number, that beforehand is all there is.
+            let sound = (count[i] > 0.0) & (length < f32::INFINITY);
+            to_right[i] = if sound { told.right * shorter } else { before.right };
+            to_down[i] = if sound { told.down * shorter } else { before.down };
+            to_variance[i] = if sound { told.variance } else { UNKNOWN };
+        }
+        put(to_right, right, at);
+        put(to_down, down, at);
+        put(to_variance, variance, at);
+    }
+}
+
+/// One window's correction, or what is known of it beforehand.
+#[derive(Clone, Copy)]
+struct Told {
+    right: f32,
+    down: f32,
+    variance: f32,
+}
+
+/// Mean and half of the covariance's trace, by the gradients' products, their pull, and what noise adds to the products, where the
+/// window's correction is known beforehand to be `before` with the inverse variance `belief`, and `before` itself has a variance.
+#[inline(always)]
+fn posterior([xx, xy, yy]: [f32; 3], [x, y]: [f32; 2], noise: f32, trust: f32, belief: f32, before: Told) -> Told {
+    let (middle, lean) = (0.5 * (xx + yy), 0.5 * (xx - yy));
+    let apart = (lean * lean + xy * xy).sqrt();
+    // The direction that is known best, by half its angle.
+    let twice = if apart > 0.0 { lean / apart } else { 1.0 };
+    let cosine = (0.5 * (1.0 + twice)).max(0.0).sqrt();
+    let sine = (0.5 * (1.0 - twice)).max(0.0).sqrt();
+    let sine = if xy < 0.0 { -sine } else { sine };
+    let priors = (noise, trust, belief, before.variance);
+    let best = (cosine * x + sine * y, cosine * before.right + sine * before.down);
+    let worst = (cosine * y - sine * x, cosine * before.down - sine * before.right);
+    let (best, of_best) = on_axis(middle + apart, best, priors);
+    let (worst, of_worst) = on_axis(middle - apart, worst, priors);
+    let variance = 0.5 * of_best + 0.5 * of_worst;
+    Told { right: cosine * best - sine * worst, down: sine * best + cosine * worst, variance }
+}
+
+/// Mean and variance along one of the two directions that know nothing of each other.
+#[inline(always)]
+fn on_axis(
+    information: f32,
+    (pull, from): (f32, f32),
+    (noise, trust, belief, unsure): (f32, f32, f32, f32),
+) -> (f32, f32) {
+    // Noise in the gradients meets noise in the difference, which gives pulls though nothing is known.
+    let trust = if information > 0.0 { trust * information / (information + noise) } else { 0.0 };
+    let known = information.max(0.0) * trust;
+    let left = belief / (known + belief);
+    ((pull * trust + belief * from) / (known + belief), 1.0 / (known + belief) + left * left * unsure)
+}
+
+/// e⁻ˣ of what is not negative, to 10⁻⁷; what the system's has no vectors for.
+#[inline(always)]
+fn fading(x: f32) -> f32 {
+    /// Adding it leaves whole numbers in the last digits.
+    const WHOLE: f32 = 12_582_912.0;
+    // Beyond, it is nothing beside one.
+    let x = -x.min(80.0);
+    let shifted = x * std::f32::consts::LOG2_E + WHOLE;
+    let whole = shifted - WHOLE;
+    // The logarithm of two in two parts, of which the first has few digits: none is lost.
+    let rest = (x - whole * 0.693_359_4) + whole * 2.121_944_4e-4;
+    let mut power = 1.0 / 5040.0;
+    for term in [1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0] {
+        power = power * rest + term;
+    }
+    power * f32::from_bits((shifted.to_bits() << 23).wrapping_add(1.0f32.to_bits()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_fades_does_so_as_the_exponential() {
+        for step in 0..100_000 {
+            let x = 0.001 * step as f32;
+            let (found, expected) = (f64::from(fading(x)), (-f64::from(x.min(80.0))).exp());
+            assert!((found - expected).abs() <= 1e-7 * expected, "{x}: {found}, expected {expected}");
+        }
+        assert_eq!(fading(0.0), 1.0);
     }
 }

@@ -5,7 +5,7 @@
 
 use multiversion::multiversion;
 
-use super::{CELL, FLOOR, pyramid::Sums};
+use super::{CELL, FLOOR, SIDE_BY_SIDE, put, pyramid::Sums, some};
 use crate::exposure::{Exposed, Pair};
 
 /// What the blur leaves of the variance of white noise: (3/8)².
@@ -53,12 +53,14 @@ pub(super) struct Warp {
     difference: Vec<f32>,
     /// 1 where there is a difference, else 0.
     valid: Vec<f32>,
-    /// Where each pixel of the older frame stands in the newer one, x then y.
+    /// The cells' vectors, right and down.
+    vectors: [Vec<f32>; 2],
+    /// How far each pixel of a row of the older frame has moved, right and down.
     places: [Vec<f32>; 2],
     /// How those of a row are read, [`SIDE_BY_SIDE`] together.
     reads: Vec<Reads>,
-    /// Vectors of a row of cells, with one more at either end.
-    line: [Vec<f32>; 2],
+    /// Vectors between two rows of cells on one axis, with one more at either end.
+    line: Vec<f32>,
     /// The products of a row of cells, pixel by pixel.
     products: Vec<f32>,
 }
@@ -70,8 +72,8 @@ impl Warp {
         pair: &Pair<'_>,
         [older, newer]: [&[f32]; 2],
         raster: [usize; 2],
-        start: &[f32],
-        change: &[f32],
+        start: &[Vec<f32>; 2],
+        change: &[Vec<f32>; 2],
     ) {
         let (width, height) = (pair.older.width, pair.older.height);
         for plane in [&mut self.mean, &mut self.difference, &mut self.valid] {
@@ -79,14 +81,18 @@ impl Warp {
         }
         let pixels = (CELL * raster[0]).next_multiple_of(SIDE_BY_SIDE);
         self.places.iter_mut().for_each(|places| places.resize(pixels, 0.0));
-        self.line.iter_mut().for_each(|line| line.resize(raster[0] + 2, 0.0));
+        self.line.resize(raster[0] + 2, 0.0);
+        for ((vectors, start), change) in self.vectors.iter_mut().zip(start).zip(change) {
+            vectors.clear();
+            vectors.extend(start.iter().zip(change).map(|(start, change)| start + change));
+        }
         self.reads.resize(pixels / SIDE_BY_SIDE, Reads::default());
         self.valid.fill(0.0);
         let covered = CELL * raster[0];
         let marks = |exposed: &'_ Exposed| exposed.saturated_part > 0.0;
         let hidden = if marks(pair.newer) { &pair.newer.saturated[..] } else { &[] };
         for y in 0..CELL * raster[1] {
-            self.place(y, raster, start, change);
+            self.place(y, raster);
             let row = y * width..y * width + covered;
             let out = [&mut self.mean[row.clone()], &mut self.difference[row.clone()], &mut self.valid[row.clone()]];
             weigh(&mut self.reads, [width, height], y, [&self.places[0], &self.places[1]]);
@@ -100,30 +106,14 @@ impl Warp {
     }
 
     /// The displacement of each pixel of row `y`.
-    fn place(&mut self, y: usize, [columns, rows]: [usize; 2], start: &[f32], change: &[f32]) {
+    fn place(&mut self, y: usize, [columns, rows]: [usize; 2]) {
         let place = (y as f32 + 0.5) / CELL as f32 - 0.5;
         let part = place - place.floor();
         let upper = (place.floor().max(0.0) as usize).min(rows - 1);
         let lower = ((place.floor() + 1.0) as usize).min(rows - 1);
-        for (axis, (line, places)) in self.line.iter_mut().zip(&mut self.places).enumerate() {
-            let at = |row: usize, column: usize| {
-                let cell = 2 * (row * columns + column) + axis;
-                start[cell] + change[cell]
-            };
-            for (column, value) in line[1..=columns].iter_mut().enumerate() {
-                let above = at(upper, column);
-                *value = above + (at(lower, column) - above) * part;
-            }
-            (line[0], line[columns + 1]) = (line[1], line[columns]);
-            for (three, four) in line.windows(3).zip(places.as_chunks_mut::<CELL>().0) {
-                let (left, right) = (three[1] - three[0], three[2] - three[1]);
-                *four = [
-                    three[1] - 0.375 * left,
-                    three[1] - 0.125 * left,
-                    three[1] + 0.125 * right,
-                    three[1] + 0.375 * right,
-                ];
-            }
+        for (vectors, places) in self.vectors.iter().zip(&mut self.places) {
+            let both = [upper, lower].map(|row| &vectors[row * columns..][..columns]);
+            place_row(both, part, &mut self.line, places);
         }
     }
 
@@ -150,14 +140,27 @@ impl Warp {
     }
 }
 
-/// Pixels whose weights are found at once.
-const SIDE_BY_SIDE: usize = 16;
+/// The vectors of a row of pixels, between two rows of cells: the lower one counts for `part`.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
+fn place_row([upper, lower]: [&[f32]; 2], part: f32, line: &mut [f32], places: &mut [f32]) {
+    let columns = upper.len();
+    for ((value, above), below) in line[1..].iter_mut().zip(upper).zip(lower) {
+        *value = above + (below - above) * part;
+    }
+    (line[0], line[columns + 1]) = (line[1], line[columns]);
+    for (three, four) in line.windows(3).zip(places.as_chunks_mut::<CELL>().0) {
+        let (left, right) = (three[1] - three[0], three[2] - three[1]);
+        *four = [three[1] - 0.375 * left, three[1] - 0.125 * left, three[1] + 0.125 * right, three[1] + 0.375 * right];
+    }
+}
 
 /// From which sixteen pixels each of some is read, and what they weigh, by Catmull and Rom's cubic.
 #[derive(Debug, Clone, Copy, Default)]
 struct Reads {
     /// The first of them, or [`NOWHERE`].
     first: [i32; SIDE_BY_SIDE],
+    /// Whether each is read one column to the right of the one before, as nearly all are where vectors are alike.
+    in_a_row: bool,
     /// Weights of their columns, and of their rows.
     across: [[f32; SIDE_BY_SIDE]; 4],
     down: [[f32; SIDE_BY_SIDE]; 4],
@@ -177,19 +180,30 @@ fn weigh(reads: &mut [Reads], [width, height]: [usize; 2], y: usize, places: [&[
             // Asked this way round, a NaN is outside.
             let inside = (to_x >= 1.0) & (to_y >= 1.0) & (to_x < right) & (to_y < bottom);
             let (to_x, to_y) = (if inside { to_x } else { 1.0 }, if inside { to_y } else { 1.0 });
-            let (column, row) = (to_x as i32, to_y as i32);
-            let first = (row - 1) * width as i32 + column - 1;
+            let (column, row) = (to_x.floor(), to_y.floor());
+            let first = (count(row) - 1) * width as i32 + count(column) - 1;
             reads.first[i] = if inside { first } else { NOWHERE };
-            let (of_columns, of_rows) = (cubic(to_x - column as f32), cubic(to_y - row as f32));
+            let (of_columns, of_rows) = (cubic(to_x - column), cubic(to_y - row));
             for tap in 0..4 {
                 reads.across[tap][i] = of_columns[tap];
                 reads.down[tap][i] = of_rows[tap];
             }
         }
+        let begin = reads.first[0];
+        let apart = reads.first.iter().enumerate().fold(0, |apart, (i, first)| apart | (first - begin - i as i32));
+        reads.in_a_row = begin != NOWHERE && apart == 0;
     }
 }
 
+/// A whole number from 0 to 2²³ as an integer: a cast would look for all others too, one by one.
+#[inline(always)]
+fn count(whole: f32) -> i32 {
+    const DIGITS: f32 = 8_388_608.0;
+    (whole + DIGITS).to_bits() as i32 - DIGITS.to_bits() as i32
+}
+
 /// Reads `newer` where the pixels of one row went; not where `hidden` marks it.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
 fn sample(
     newer: &[f32],
     hidden: &[u8],
@@ -198,25 +212,83 @@ fn sample(
     older: &[f32],
     [mean, difference, valid]: [&mut [f32]; 3],
 ) {
-    for x in 0..older.len() {
-        let (Reads { first, across, down }, i) = (&reads[x / SIDE_BY_SIDE], x % SIDE_BY_SIDE);
-        let Ok(first) = usize::try_from(first[i]) else {
-            (mean[x], difference[x]) = (older[x], 0.0);
-            continue;
-        };
-        let [across, down] = [across, down].map(|weights| weights.map(|of_tap| of_tap[i]));
-        let rows: [&[f32]; 4] = std::array::from_fn(|row| &newer[first + row * width..][..4]);
-        // Four columns at once: they lie side by side.
-        let columns: [f32; 4] = std::array::from_fn(|at| {
-            rows[0][at] * down[0] + rows[1][at] * down[1] + (rows[2][at] * down[2] + rows[3][at] * down[3])
-        });
-        let value = columns[0] * across[0] + columns[1] * across[1] + (columns[2] * across[2] + columns[3] * across[3]);
-        (mean[x], difference[x]) = (0.5 * (older[x] + value), value - older[x]);
-        // The nearest of the sixteen is one of the middle four.
-        let further = |weights: [f32; 4]| usize::from(weights[2] > weights[1]);
-        let nearest = first + (1 + further(down)) * width + 1 + further(across);
-        valid[x] = 1.0 - f32::from(hidden.get(nearest).copied().unwrap_or(0));
+    for (block, reads) in reads.iter().enumerate() {
+        let x = block * SIDE_BY_SIDE;
+        let here = some(older, x);
+        let mut values = here;
+        if reads.in_a_row {
+            reads.all(newer, width, &mut values);
+        } else {
+            reads.each(newer, width, &mut values);
+        }
+        let (mut means, mut differences, mut seen) = (here, here, here);
+        for i in 0..SIDE_BY_SIDE {
+            means[i] = 0.5 * (here[i] + values[i]);
+            differences[i] = values[i] - here[i];
+            seen[i] = if reads.first[i] == NOWHERE { 0.0 } else { 1.0 };
+        }
+        if !hidden.is_empty() {
+            for (i, seen) in seen.iter_mut().enumerate() {
+                *seen -= reads.nearest(width, i).map_or(0.0, |nearest| f32::from(hidden[nearest]));
+            }
+        }
+        put(means, mean, x);
+        put(differences, difference, x);
+        put(seen, valid, x);
     }
+}
+
+impl Reads {
+    /// All values of pixels that are read wherever they went; those that are nowhere stay as they are.
+    #[inline(always)]
+    fn each(&self, newer: &[f32], width: usize, values: &mut [f32; SIDE_BY_SIDE]) {
+        let Self { across: [w, x, y, z], down: [e, f, g, h], .. } = self;
+        // Four columns at once: they lie side by side.
+        let mut columns = [[0.0; 4]; SIDE_BY_SIDE];
+        for (i, columns) in columns.iter_mut().enumerate() {
+            // Who is nowhere reads what comes first, so that nobody need ask.
+            let newer = &newer[self.first[i].max(0) as usize..];
+            let (a, b, c, d) = (&newer[..4], &newer[width..][..4], &newer[2 * width..][..4], &newer[3 * width..][..4]);
+            for at in 0..4 {
+                columns[at] = of_four([a[at], b[at], c[at], d[at]], [e[i], f[i], g[i], h[i]]);
+            }
+        }
+        for i in 0..SIDE_BY_SIDE {
+            let value = of_four(columns[i], [w[i], x[i], y[i], z[i]]);
+            values[i] = if self.first[i] == NOWHERE { values[i] } else { value };
+        }
+    }
+
+    /// All values of pixels that are read one beside the other.
+    #[inline(always)]
+    fn all(&self, newer: &[f32], width: usize, values: &mut [f32; SIDE_BY_SIDE]) {
+        const SEEN: usize = SIDE_BY_SIDE + 3;
+        let newer = &newer[self.first[0] as usize..];
+        let (a, b, c, d) =
+            (&newer[..SEEN], &newer[width..][..SEEN], &newer[2 * width..][..SEEN], &newer[3 * width..][..SEEN]);
+        let Self { across: [w, x, y, z], down: [e, f, g, h], .. } = self;
+        for i in 0..SIDE_BY_SIDE {
+            let down = [e[i], f[i], g[i], h[i]];
+            let first = of_four([a[i], b[i], c[i], d[i]], down);
+            let second = of_four([a[i + 1], b[i + 1], c[i + 1], d[i + 1]], down);
+            let third = of_four([a[i + 2], b[i + 2], c[i + 2], d[i + 2]], down);
+            let fourth = of_four([a[i + 3], b[i + 3], c[i + 3], d[i + 3]], down);
+            values[i] = of_four([first, second, third, fourth], [w[i], x[i], y[i], z[i]]);
+        }
+    }
+
+    /// Of the sixteen that a pixel is made of the nearest, one of the middle four.
+    #[inline(always)]
+    fn nearest(&self, width: usize, i: usize) -> Option<usize> {
+        let first = usize::try_from(self.first[i]).ok()?;
+        let further = |weights: &[[f32; SIDE_BY_SIDE]; 4]| usize::from(weights[2][i] > weights[1][i]);
+        Some(first + (1 + further(&self.down)) * width + 1 + further(&self.across))
+    }
+}
+
+#[inline(always)]
+fn of_four(values: [f32; 4], weights: [f32; 4]) -> f32 {
+    values[0] * weights[0] + values[1] * weights[1] + (values[2] * weights[2] + values[3] * weights[3])
 }
 
 /// Weights of the four pixels around a place that lies `part` behind the second.
