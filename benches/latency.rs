@@ -1,9 +1,10 @@
 //! From a camera's stamp to flow in another's hands, through zenoh, the network and shared memory:
-//! `cargo bench --bench latency [-- FRAMES [HZ [PRECISION]]]`.
+//! `cargo bench --bench latency [-- FRAMES [HZ [PRECISION [PRIORITY]]]]`.
 //!
 //! The camera is a thread with a zenoh session of its own (TCP, as between two programs), the reader one with an iceoryx2
 //! node of its own; the node between them is the one that `nightflow run` runs. What is told is of every step that the
-//! reader got, from the frame's stamp, which is taken before it is encoded.
+//! reader got, from the frame's stamp, which is taken before it is encoded. PRIORITY is `[flow] priority`; camera and reader,
+//! which the node's thread starts here, have it too.
 
 use std::{
     error::Error,
@@ -141,26 +142,27 @@ fn measure(settings: &str, size: [u32; 2], frames: usize, hz: f64) -> Outcome<Ru
     Ok(Run { ms, displaced, size })
 }
 
-fn report(frames: usize, hz: Option<f64>, precision: Option<&str>) -> Outcome<()> {
+fn report(frames: usize, hz: Option<f64>, precision: Option<&str>, priority: u8) -> Outcome<()> {
     // A rate that the network keeps with room to spare on two cores.
-    let mut ways = vec![("fp32", "", 15.0)];
+    let mut ways = vec![("fp32", 15.0)];
     if convolutions::Unit::best().is_fast() {
-        ways.push(("bf16", "[flow]\nprecision = \"bf16\"", 30.0));
+        ways.push(("bf16", 30.0));
     }
     let able: Vec<&str> = ways.iter().map(|way| way.0).collect();
     if let Some(wanted) = precision.filter(|wanted| !able.contains(wanted)) {
         return Err(format!("precision {wanted:?}: this machine has {}", able.join(" and ")).into());
     }
     ways.retain(|way| precision.is_none_or(|wanted| way.0 == wanted));
-    println!("camera's stamp to received flow, {frames} frames each, milliseconds:\n");
+    println!("camera's stamp to received flow, {frames} frames each, priority {priority}, milliseconds:\n");
     println!(
         "| precision, camera | steps | displaced | p50 | p99 | p99.9 | most | p99 / p50 |\n|{}",
         " --- |".repeat(8)
     );
-    for (precision, settings, own) in ways {
+    for (precision, own) in ways {
+        let settings = format!("[flow]\nprecision = {precision:?}\npriority = {priority}");
         for size in SIZES {
             let hz = hz.unwrap_or(own);
-            let run = measure(settings, size, frames, hz)?;
+            let run = measure(&settings, size, frames, hz)?;
             let [p50, p99, p999, most] = [0.5, 0.99, 0.999, 1.0].map(|part| run.quantile(part));
             let [width, height] = run.size;
             println!(
@@ -182,7 +184,9 @@ fn main() -> ExitCode {
     let (trial, slow) = (24, 10.0);
     let frames = given.next().and_then(|word| word.parse().ok()).unwrap_or(if bench { FRAMES } else { trial });
     let hz = given.next().and_then(|word| word.parse().ok()).or((!bench).then_some(slow));
-    if let Err(reason) = report(frames, hz, given.next().as_deref()) {
+    let precision = given.next();
+    let priority = given.next().and_then(|word| word.parse().ok()).unwrap_or(0);
+    if let Err(reason) = report(frames, hz, precision.as_deref(), priority) {
         eprintln!("latency was not measured: {reason}");
         return ExitCode::FAILURE;
     }

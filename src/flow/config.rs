@@ -82,6 +82,9 @@ pub struct Config {
     pub threads: usize,
     /// Cores that these threads are kept on, one each; empty: wherever there is room.
     pub cores: Vec<usize>,
+    /// Real-time priority of the thread that opens the network and of all that it starts, 1 to 99; 0: none. See
+    /// [`crate::flow::priority`].
+    pub priority: u8,
     /// Move memory to large pages once a size of frames has all of its own, see [`crate::flow::pages`].
     pub large_pages: bool,
     /// What computes cost volumes and convolutions; plain where the network has no fused graph, and for providers other than `cpu`.
@@ -126,6 +129,7 @@ impl Default for Config {
             runtime: PathBuf::new(),
             threads: 2,
             cores: vec![],
+            priority: 0,
             large_pages: true,
             operators: Operators::Fused,
             provider: Provider::Cpu,
@@ -162,6 +166,11 @@ pub const REASONS: &[(&str, &str)] = &[
     (
         "cores",
         "empty: the system knows best where there is room; naming them pays where something else would push the network about,          such as cores that are kept free for it (isolcpus)",
+    ),
+    (
+        "priority",
+        "0: the system must allow another; with one, other programs on the same cores no longer make one frame in a hundred late \
+         (launch_configs/README.md)",
     ),
     (
         "large_pages",

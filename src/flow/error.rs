@@ -37,6 +37,14 @@ pub enum Error {
         /// What is wrong, and what is expected.
         why: String,
     },
+    /// The network's threads cannot have this priority.
+    #[error("[flow] priority = {priority}: {why}")]
+    Priority {
+        /// As set.
+        priority: u8,
+        /// What is wrong, and what is expected.
+        why: String,
+    },
     /// The manifest or a file of it cannot be read.
     #[error("{}: {reason}", path.display())]
     Manifest {

@@ -15,6 +15,7 @@ use crate::{
         onnx::Onnx,
         padding::{self, Padded},
         pages::{Moved, Moving},
+        priority,
         refine::Refiner,
     },
 };
@@ -69,9 +70,11 @@ pub struct Counts {
 
 impl Matcher {
     /// With the network that the settings name, through ONNX Runtime; checked against its golden output unless the
-    /// settings say otherwise.
+    /// settings say otherwise. With `[flow] priority` the calling thread has it from here on.
     pub fn open(config: &Config) -> Result<Self, Error> {
         cores::check(config)?;
+        // Before the runtime starts its threads, which inherit it.
+        priority::take(config)?;
         let mut matcher = Self::with(config, Box::new(Onnx::open(config)?));
         if config.golden_check {
             matcher.check_golden()?;

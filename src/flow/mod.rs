@@ -20,6 +20,7 @@ mod onnx_shared;
 mod operators;
 pub mod padding;
 pub mod pages;
+pub mod priority;
 pub mod profile;
 mod provider;
 mod refine;

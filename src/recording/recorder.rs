@@ -18,7 +18,7 @@ use super::{
 };
 use crate::{
     camera::{self, Sample},
-    clock,
+    clock, flow,
     publish::{self, Offer, Sink},
     wire,
 };
@@ -195,6 +195,8 @@ impl Drop for Recorder {
 
 /// The thread: writes what waits, syncs every so often, finishes the file when the queue is closed and empty.
 fn write_out(mut pen: Pen, queue: &Queue, progress: &Progress, every: Duration) -> Result<(), Error> {
+    // What is to be kept has a queue to wait in; the next frame has none.
+    flow::priority::leave();
     let mut synced_at = clock::instant();
     let mut unsynced = 0;
     loop {

@@ -2,13 +2,20 @@
 
 mod opening;
 
-use std::{fs, path::Path, process::Command};
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::Command,
+    thread,
+};
 
 use nightflow::{
     clock::Stamp,
     exposure::{Exposed, Pair},
     flow::{
-        Cause, Config, Error, Fake, Flow, Grid, Lender, Matcher, Operators, Own, Resolution, State, cores, runtime,
+        Cause, Config, Error, Fake, Flow, Grid, Lender, Matcher, Operators, Own, Resolution, State, cores,
+        priority::{self, Policy},
+        runtime,
     },
 };
 
@@ -356,7 +363,6 @@ fn threads_stay_on_the_cores_that_are_named() {
     let allowed = cores::allowed();
     let own: Vec<usize> = allowed.iter().rev().take(2).copied().collect();
     let config = Config { threads: own.len(), cores: own.clone(), ..Config::default() };
-    let threads = || fs::read_dir("/proc/self/task").unwrap().map(|entry| entry.unwrap().path()).collect::<Vec<_>>();
     let before = threads();
     let mut pinned = Matcher::open(&config).unwrap();
     // Of other tests' threads at the same time none is on a single core.
@@ -378,6 +384,54 @@ fn threads_stay_on_the_cores_that_are_named() {
     let wrong = Config { cores: vec![1023; 2], threads: 2, ..Config::default() };
     let said = Matcher::open(&wrong).map(drop).unwrap_err().to_string();
     assert!(said.starts_with("[flow] cores = [1023, 1023]: 1023 is none that this program may run on"), "{said}");
+}
+
+/// The threads of this program.
+pub fn threads() -> Vec<PathBuf> {
+    fs::read_dir("/proc/self/task").unwrap().map(|entry| entry.unwrap().path()).collect()
+}
+
+/// The real-time priorities of the threads that `before` does not name.
+pub fn priorities(before: &[PathBuf]) -> Vec<u8> {
+    let new = threads().into_iter().filter(|thread| !before.contains(thread));
+    // The fortieth of all, and the name, which may hold blanks, is the second.
+    let told = new.filter_map(|thread| fs::read_to_string(thread.join("stat")).ok());
+    told.filter_map(|text| text.rsplit(") ").next()?.split(' ').nth(37)?.parse().ok()).collect()
+}
+
+/// On a thread of its own, for the test's runner is to stay what it is: what was taken goes on to who is started, until that leaves.
+fn passes_on(priority: u8) {
+    priority::leave();
+    priority::take(&Config { priority: 0, ..Config::default() }).unwrap();
+    assert_eq!(priority::current(), Policy::Ordinary);
+    priority::take(&Config { priority, ..Config::default() }).unwrap();
+    let started = || (priority::current(), priority::leave(), priority::current());
+    let (inherited, (), left) = thread::spawn(started).join().unwrap();
+    assert_eq!((inherited, left), (Policy::RealTime(priority), Policy::Ordinary));
+    assert_eq!(priority::current(), Policy::RealTime(priority), "who leaves takes nobody along");
+}
+
+#[test]
+fn the_networks_threads_have_the_priority_that_is_set_or_the_node_says_why_not() {
+    // Nobody else here has this one.
+    let config = Config { threads: 2, priority: 7, ..Config::default() };
+    let opening = thread::spawn(move || {
+        let before = threads();
+        match Matcher::open(&config) {
+            // A session each for pyramid and decoder, and the caller is one thread of both.
+            Ok(_open) => {
+                assert_eq!(priorities(&before).iter().filter(|&&priority| priority == 7).count(), 2);
+                thread::spawn(|| passes_on(8)).join().unwrap();
+            }
+            // Who tests may be nobody to whom the system grants it, and is told what would.
+            Err(why) => {
+                let said = why.to_string();
+                assert!(said.contains("[flow] priority = 7: ") && said.contains("LimitRTPRIO=7"), "{said}");
+                assert_eq!(priority::current(), Policy::Ordinary);
+            }
+        }
+    });
+    opening.join().unwrap();
 }
 
 #[test]

@@ -1,6 +1,12 @@
 //! Recordings: written, read by the field's own readers, and compared.
 
-use std::{collections::BTreeMap, fs, path::Path, sync::Arc, time::Duration};
+use std::{
+    collections::BTreeMap,
+    fs,
+    path::Path,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use nightflow::{
     camera::{
@@ -9,7 +15,10 @@ use nightflow::{
     },
     clock::Stamp,
     exposure::Exposed,
-    flow::{Cause, Flow, Grid, State},
+    flow::{
+        self, Cause, Flow, Grid, State,
+        priority::{self, Policy},
+    },
     motion::{Integrated, Lack, NoFlow, Obstacles, SECTORS, Scale, Sector, Velocity},
     publish::{Moved, Offer, Sink},
     recording::{self, Compression, Config, Output, Outputs, Recorder, Writer, check},
@@ -164,6 +173,28 @@ pub fn read(path: &Path, config: &camera::Config) -> Vec<Sample> {
             Next::End => return samples,
         }
     }
+}
+
+#[test]
+fn recording_is_ordinary_work_where_the_road_has_priority() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("patient.mcap");
+    // A thread of its own, and nobody else here has this priority.
+    std::thread::spawn(move || {
+        let before = crate::flow::threads();
+        let taken = priority::take(&flow::Config { priority: 6, ..flow::Config::default() });
+        let mut recorder = record(&path, 3, Config::default());
+        let late = Instant::now() + Duration::from_secs(10);
+        // It is started with its starter's priority.
+        while crate::flow::priorities(&before).contains(&6) {
+            assert!(Instant::now() < late, "the recorder has kept its starter's priority");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        assert_eq!(taken.is_ok(), priority::current() == Policy::RealTime(6));
+        recorder.finish().unwrap();
+    })
+    .join()
+    .unwrap();
 }
 
 #[test]

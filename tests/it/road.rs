@@ -293,6 +293,7 @@ fn the_doctor_names_every_part() {
     for part in [
         "processor",
         "memory pages",
+        "scheduling",
         "runtime",
         "model",
         "golden output",

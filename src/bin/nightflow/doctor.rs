@@ -13,6 +13,7 @@ use nightflow::{
         convolutions::Unit,
         manifest,
         pages::{self, Moved},
+        priority::{self, Policy},
     },
     publish::iceoryx2::{bytes_needed, free_bytes},
 };
@@ -110,6 +111,14 @@ fn memory_pages(flow: &flow::Config) -> Finding {
     })
 }
 
+/// How the system shares the cores between the network's threads and others'.
+fn scheduling() -> Finding {
+    Finding::Ok(match priority::current() {
+        Policy::RealTime(priority) => format!("real-time priority {priority}: no ordinary program gets in between"),
+        Policy::Ordinary => "ordinary: what else runs on these cores gets in between ([flow] priority)".into(),
+    })
+}
+
 /// Runtime library, model files and golden output, and how long one step takes here.
 fn network(config: &Config) -> Vec<(&'static str, Finding)> {
     let mut matcher = match Matcher::open(&config.flow) {
@@ -147,6 +156,7 @@ fn network(config: &Config) -> Vec<(&'static str, Finding)> {
         ),
         ("golden output", golden),
         ("memory pages", pages),
+        ("scheduling", scheduling()),
         ("speed", speed),
     ]
 }
