@@ -176,17 +176,24 @@ fn report(frames: usize, hz: Option<f64>, precision: Option<&str>, priority: u8)
     Ok(())
 }
 
+/// A word as the number that it should be; `None` where none is given.
+fn number<T: std::str::FromStr>(word: Option<String>, name: &str) -> Outcome<Option<T>> {
+    word.map(|word| word.parse().map_err(|_| format!("{name} {word:?}: expected a number").into())).transpose()
+}
+
 fn main() -> ExitCode {
     let bench = std::env::args().any(|word| word == "--bench");
     let mut given = std::env::args().skip(1).filter(|word| !word.starts_with("--"));
     // Under `cargo test --benches` it only shows that it still runs: unoptimised, beside other work, so that a few frames at
     // full rate may all be the warm-up. Slower than seven a second, two frames are no pair.
     let (trial, slow) = (24, 10.0);
-    let frames = given.next().and_then(|word| word.parse().ok()).unwrap_or(if bench { FRAMES } else { trial });
-    let hz = given.next().and_then(|word| word.parse().ok()).or((!bench).then_some(slow));
-    let precision = given.next();
-    let priority = given.next().and_then(|word| word.parse().ok()).unwrap_or(0);
-    if let Err(reason) = report(frames, hz, precision.as_deref(), priority) {
+    let outcome = (|| {
+        let frames = number(given.next(), "FRAMES")?.unwrap_or(if bench { FRAMES } else { trial });
+        let hz = number(given.next(), "HZ")?.or((!bench).then_some(slow));
+        let precision = given.next();
+        report(frames, hz, precision.as_deref(), number(given.next(), "PRIORITY")?.unwrap_or(0))
+    })();
+    if let Err(reason) = outcome {
         eprintln!("latency was not measured: {reason}");
         return ExitCode::FAILURE;
     }

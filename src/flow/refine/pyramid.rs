@@ -403,4 +403,96 @@ mod tests {
         }
         assert_eq!(fading(0.0), 1.0);
     }
+
+    /// Of the same values in every plane.
+    fn sums([width, height]: [usize; 2]) -> Sums {
+        let mut sums = Sums::default();
+        sums.size([width, height]);
+        let values = (0..width * height).map(|i| (1 + (i * 37) % 100) as f32 / 101.0);
+        sums.planes = values.cycle().take(sums.planes.len()).collect();
+        sums
+    }
+
+    #[test]
+    fn windows_of_every_size_are_what_they_are_said_to_be() {
+        for size in (1..9).flat_map(|width| (1..6).map(move |height| [width, height])) {
+            let from = sums(size);
+            let inside = |x: i32, y: i32| (0..size[0] as i32).contains(&x) && (0..size[1] as i32).contains(&y);
+            let at = |x: i32, y: i32| f64::from(from.planes[y as usize * size[0] + x as usize]);
+            let near = |x: i32, y: i32| at(x.clamp(0, size[0] as i32 - 1), y.clamp(0, size[1] as i32 - 1));
+            let mut own = Sums::default();
+            smooth(&from, &mut own);
+            let mut levels = vec![];
+            halve(&from, &mut levels);
+            let half = &levels[0].sums;
+            for (window, step, weights) in [(&own, 1, [1.0, 4.0, 6.0, 4.0, 1.0]), (half, 2, [0.0, 1.0, 3.0, 3.0, 1.0])]
+            {
+                let whole = if step == 1 { 36.0 } else { 16.0 };
+                for cell in 0..window.cells() {
+                    let (x, y) = ((cell % window.width) as i32 * step, (cell / window.width) as i32 * step);
+                    let mut expected = 0.0;
+                    for (j, i) in (-2..=2).flat_map(|j| (-2..=2).map(move |i| (j, i))) {
+                        let weight = weights[(i + 2) as usize] * weights[(j + 2) as usize] / whole;
+                        // A cell's own windows repeat the edge; of the larger ones' sums nothing may count twice.
+                        if step == 1 || inside(x + i, y + j) {
+                            expected += weight * near(x + i, y + j);
+                        }
+                    }
+                    assert!(
+                        (f64::from(window.planes[cell]) - expected).abs() < 1e-5,
+                        "{size:?}, step {step}, cell {cell}"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_a_larger_window_found_is_bilinear_between_its_centres() {
+        for size in (1..12).flat_map(|width| (1..6).map(move |height| [width, height])) {
+            let smaller = sums(size);
+            let mut larger = Level::default();
+            larger.sums.size(size.map(|side: usize| side.div_ceil(2)));
+            larger.found.begin(larger.sums.cells());
+            // A plane is what it is between centres too, away from the edge, where it is continued flat.
+            let (width, height) = (larger.sums.width, larger.sums.height);
+            for cell in 0..width * height {
+                larger.found.change[0][cell] = (cell % width) as f32;
+                larger.found.change[1][cell] = (cell / width) as f32;
+                larger.found.variance[cell] = 2.0;
+            }
+            let mut found = Found::default();
+            found.begin(size[0] * size[1]);
+            larger.widen(&smaller, &mut found);
+            for cell in 0..size[0] * size[1] {
+                let place = |at: usize, last: usize| (at as f32 / 2.0 - 0.25).clamp(0.0, last as f32);
+                let expected = [place(cell % size[0], width - 1), place(cell / size[0], height - 1), 2.0];
+                let came = found.planes().map(|plane| plane[cell]);
+                assert!(
+                    came.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6),
+                    "{size:?}, {cell}: {came:?}, {expected:?}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn where_nothing_is_seen_that_beforehand_stays_and_is_unsure() {
+        let mut seen = sums([20, 1]);
+        for plane in seen.planes.chunks_exact_mut(20) {
+            plane[3] = 0.0;
+            plane[17] = f32::NAN;
+        }
+        let mut found = Found::default();
+        found.begin(20);
+        found.change[0].fill(0.25);
+        settle(&seen, LOCAL, &mut found);
+        for cell in [3, 17] {
+            assert_eq!((found.change[0][cell], found.change[1][cell], found.variance[cell]), (0.25, 0.0, UNKNOWN));
+        }
+        assert!(
+            found.variance.iter().enumerate().all(|(cell, variance)| [3, 17].contains(&cell) || *variance < UNKNOWN)
+        );
+        assert!(found.change[0].iter().chain(&found.change[1]).all(|change| change.abs() <= REACH + 1e-6));
+    }
 }

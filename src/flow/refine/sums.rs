@@ -229,7 +229,10 @@ fn sample(
         }
         if !hidden.is_empty() {
             for (i, seen) in seen.iter_mut().enumerate() {
-                *seen -= reads.nearest(width, i).map_or(0.0, |nearest| f32::from(hidden[nearest]));
+                *seen -= reads
+                    .nearest(width, i)
+                    .and_then(|nearest| hidden.get(nearest))
+                    .map_or(0.0, |mark| f32::from(*mark));
             }
         }
         put(means, mean, x);
@@ -331,5 +334,53 @@ fn add(mean: [&[f32]; 5], pixels: [&[f32]; 3], [slope, base]: [f32; 2], covered:
         rr[x] += valid[x] * r * r / (variance * KEPT + FLOOR);
         nn[x] += weight * variance * (0.25 * SLOPED);
         count[x] += valid[x];
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: [usize; 2] = [60, 20];
+
+    /// Mean, difference and validity of a row whose pixels went to `places`; `one_by_one` takes no notice of who is read in a row.
+    fn sampled(places: [&[f32]; 2], hidden: &[u8], one_by_one: bool) -> ([Vec<f32>; 3], usize) {
+        let noise =
+            |count: usize, factor: usize| (0..count).map(|i| ((i * factor) % 251) as f32 / 251.0).collect::<Vec<_>>();
+        let (newer, older) = (noise(SIZE[0] * SIZE[1], 97), noise(SIZE[0], 61));
+        let mut reads = vec![Reads::default(); places[0].len() / SIDE_BY_SIDE];
+        weigh(&mut reads, SIZE, 9, places);
+        let in_a_row = reads.iter().filter(|reads| reads.in_a_row).count();
+        reads.iter_mut().for_each(|reads| reads.in_a_row &= !one_by_one);
+        let mut out = [vec![0.0; SIZE[0]], vec![0.0; SIZE[0]], vec![0.0; SIZE[0]]];
+        let [mean, difference, valid] = &mut out;
+        sample(&newer, hidden, SIZE[0], &reads, &older, [mean, difference, valid]);
+        (out, in_a_row)
+    }
+
+    #[test]
+    fn who_is_read_in_a_row_is_read_as_everybody_else() {
+        let hidden: Vec<u8> = (0..SIZE[0] * SIZE[1]).map(|i| u8::from(i % 7 == 0)).collect();
+        for (slope, expected) in [(0.0, 3), (0.01, 2), (0.3, 0)] {
+            let along: Vec<f32> = (0..64).map(|x| 2.9 + slope * x as f32).collect();
+            let down = vec![-1.6; 64];
+            for hidden in [&[][..], &hidden] {
+                let (found, in_a_row) = sampled([&along, &down], hidden, false);
+                assert_eq!(in_a_row, expected, "slope {slope}");
+                assert_eq!(found, sampled([&along, &down], hidden, true).0);
+                assert!(found[2][..40].iter().all(|valid| *valid == 1.0) == hidden.is_empty());
+                assert!(found[2].iter().all(|valid| *valid == 0.0 || *valid == 1.0));
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_nowhere_differs_by_nothing_and_does_not_count() {
+        for nowhere in [f32::NAN, f32::INFINITY, -1e9, 1e9] {
+            let mut along = vec![0.5; 64];
+            along[20] = nowhere;
+            let ([_, difference, valid], _) = sampled([&along, &[0.0; 64]], &[], false);
+            assert_eq!((difference[20], valid[20], valid[19], valid[21]), (0.0, 0.0, 1.0, 1.0), "{nowhere}");
+        }
     }
 }
