@@ -82,10 +82,12 @@ pub(super) struct Found {
 impl Found {
     /// None, for so many cells.
     pub(super) fn begin(&mut self, cells: usize) {
-        for plane in self.planes_mut() {
-            plane.clear();
-            plane.resize(cells, 0.0);
-        }
+        self.size(cells);
+        self.planes_mut().into_iter().for_each(|plane| plane.fill(0.0));
+    }
+
+    fn size(&mut self, cells: usize) {
+        self.planes_mut().into_iter().for_each(|plane| plane.resize(cells, 0.0));
     }
 
     fn planes(&self) -> [&Vec<f32>; 3] {
@@ -198,7 +200,6 @@ pub(super) fn halve(cells: &Sums, levels: &mut Vec<Level>) {
     while let Some((level, others)) = rest.split_first_mut() {
         let (width, height) = (from.width.div_ceil(2), from.height.div_ceil(2));
         level.sums.size([width, height]);
-        level.found.begin(width * height);
         let Sums { planes, line, .. } = &mut level.sums;
         line.clear();
         line.resize(2 * width + 2, 0.0);
@@ -257,6 +258,7 @@ impl Level {
     /// What was found here, at the cells of the next smaller level: bilinear between the centres.
     fn widen(&self, smaller: &Sums, into: &mut Found) {
         let Sums { width, height, .. } = self.sums;
+        into.size(smaller.cells());
         for (from, into) in self.found.planes().into_iter().zip(into.planes_mut()) {
             for (y, out) in into.chunks_exact_mut(smaller.width).enumerate() {
                 let near = y / 2;
@@ -291,12 +293,8 @@ fn widen_row(near: &[f32], far: &[f32], out: &mut [f32]) {
 /// The correction of each window by its own sums and by what is there, which is what is known beforehand.
 fn settle(sums: &Sums, part: f32, found: &mut Found) {
     let mut planes = sums.planes.chunks_exact(sums.cells());
-    let [right, down, variance] = found.planes_mut();
-    settle_planes(
-        std::array::from_fn(|_| planes.next().unwrap_or_default()),
-        1.0 / (part * part),
-        [right, down, variance],
-    );
+    let sums = std::array::from_fn(|_| planes.next().unwrap_or_default());
+    settle_planes(sums, part, found.planes_mut().map(Vec::as_mut_slice));
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
@@ -308,7 +306,7 @@ fn settle_planes(sums: [&[f32]; Sums::PLANES], part: f32, [right, down, variance
         let (mut to_right, mut to_down, mut to_variance) = (some(right, at), some(down, at), some(variance, at));
         for i in 0..SIDE_BY_SIDE {
             let before = Told { right: to_right[i], down: to_down[i], variance: to_variance[i] };
-            let belief = belief[i] / count[i] * part;
+            let belief = belief[i] / count[i] / (part * part);
             // Gradients are believed as far as the truth is likely to be near. Where the network states an error of many pixels,
             // as in mere noise, what they say is chance, and makes much of the last digits of the vectors.
             let near = 1.0 - fading(0.5 * NEAR * NEAR * belief);
@@ -372,7 +370,8 @@ fn on_axis(
     ((pull * trust + belief * from) / (known + belief), 1.0 / (known + belief) + left * left * unsure)
 }
 
-/// e⁻ˣ of what is not negative, to 10⁻⁷; what the system's has no vectors for.
+/// e⁻ˣ of what is not negative, to 10⁻⁷: the system's is no loop over vectors, and that of [`lanes`](crate::flow::lanes) fuses products
+/// where the machine can, so that machines differ.
 #[inline(always)]
 fn fading(x: f32) -> f32 {
     /// Adding it leaves whole numbers in the last digits.
