@@ -100,7 +100,7 @@ impl Pipeline {
         // A cell at full resolution is a quarter of the cell that the setting is about.
         motion.flow_shared_sd_cells *= match config.flow.resolution {
             Resolution::Quarter => 1.0,
-            Resolution::Full => 4.0,
+            Resolution::Full | Resolution::Bilinear => 4.0,
         };
         let back = Back {
             exposure: Pairing::new(&config.exposure)?,

@@ -2,6 +2,7 @@
 
 import argparse
 import csv
+import tomllib
 from pathlib import Path
 
 import cv2
@@ -18,12 +19,18 @@ CELL = 4
 
 
 def network_flow(graphs: Exported, older: torch.Tensor, newer: torch.Tensor):
-    """Full-resolution flow [H, W, 2] and expected error at a quarter of it; sides are padded to multiples of 64."""
+    """Full-resolution flow [H, W, 2], by the upsampler where there is one, and expected error at a quarter of it; sides are padded
+    to multiples of 64."""
     height, width = older.shape[-2:]
     padding = [0, -width % 64, 0, -height % 64]
-    flow, expected = graphs(*(F.pad(f, padding, mode="reflect").numpy() for f in (older, newer)))
-    full = F.interpolate(torch.from_numpy(flow).permute(0, 3, 1, 2), scale_factor=CELL, mode="bilinear")
-    return full[0, :, :height, :width].permute(1, 2, 0).numpy(), expected[0]
+    older, newer = (F.pad(f, padding, mode="reflect").numpy() for f in (older, newer))
+    flow, expected = graphs(older, newer)
+    if graphs.upsampler:
+        full = graphs.full(older, flow, expected)[0][0]
+    else:
+        full = F.interpolate(torch.from_numpy(flow).permute(0, 3, 1, 2), scale_factor=CELL, mode="bilinear")
+        full = full[0].permute(1, 2, 0).numpy()
+    return full[:height, :width], expected[0]
 
 
 def dis_flow(older: torch.Tensor, newer: torch.Tensor, gamma: float) -> np.ndarray:
@@ -166,7 +173,9 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(arguments.threads)
     files = (str(arguments.models / f"{arguments.name}_{part}.onnx") for part in ("pyramid", "decoder"))
-    graphs = Exported(*files, arguments.threads)
+    entry = tomllib.loads((arguments.models / "manifest.toml").read_text()).get(arguments.name, {})
+    upsampler = str(arguments.models / entry["upsampler"]["file"]) if "upsampler" in entry else None
+    graphs = Exported(*files, arguments.threads, upsampler)
     held, scores = HeldOut(arguments.photographs, arguments.count, seed=23), {}
     for level in NOISE_LEVELS:
         scores[level] = Scores()

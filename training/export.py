@@ -20,6 +20,7 @@ import checkpoints
 from flownet import KINDS, FlowNet
 from networks import FACTOR, FLOW_GAIN, GAIN, OFFSET, SHIFT, STRIDE, PwcNet, doubled, halved, twice
 from raft import RaftSmall
+from upsampler import CELL, Upsampled, Upsampler
 
 OPSET = 17
 # Of operators that are not ONNX's own, and their version.
@@ -292,6 +293,21 @@ class FlowNetPairGraph(nn.Module):
         return flows[-1].permute(0, 2, 3, 1) * scale, expected[:, 0]
 
 
+class UpsamplerGraph(nn.Module):
+    """The older frame, and flow [1, H/4, W/4, 2] and expected error [1, H/4, W/4] in pixels of the network's input, to both at every
+    pixel."""
+
+    inputs, outputs = ["image", "flow", "uncertainty"], ["full_flow", "full_uncertainty"]
+
+    def __init__(self, upsampler: Upsampler):
+        super().__init__()
+        self.upsampler = upsampler
+
+    def forward(self, image, flow, uncertainty):
+        full, expected = self.upsampler(image, flow.permute(0, 3, 1, 2), uncertainty[:, None])
+        return full.permute(0, 2, 3, 1), expected[:, 0]
+
+
 GRAPHS = {
     PwcNet: (FrameGraph, PairGraph),
     RaftSmall: (RaftFrameGraph, RaftPairGraph),
@@ -377,15 +393,28 @@ def graphs_of(network: nn.Module, plain: bool = False) -> dict[str, onnx.ModelPr
     return {part: with_half_weights(graph) for part, graph in graphs.items()}
 
 
-class Exported:
-    """The two graphs in ONNX Runtime."""
+def upsampler_graph(upsampler: Upsampler) -> onnx.ModelProto:
+    """The graph of an upsampler."""
+    rows, columns = GOLDEN_HEIGHT // CELL, GOLDEN_WIDTH // CELL
+    inputs = (torch.rand(1, 3, GOLDEN_HEIGHT, GOLDEN_WIDTH), torch.rand(1, rows, columns, 2), torch.rand(1, rows, columns) + 0.1)
+    raster, whole = {1: "rows_level2", 2: "columns_level2"}, {1: "height", 2: "width"}
+    axes = {"image": {2: "height", 3: "width"}, "flow": raster, "uncertainty": raster, "full_flow": whole, "full_uncertainty": whole}
+    return with_half_weights(traced(UpsamplerGraph(upsampler).eval(), inputs, UpsamplerGraph.inputs, UpsamplerGraph.outputs, axes))
 
-    def __init__(self, pyramid: bytes | str, decoder: bytes | str, threads: int = 2):
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        self.pyramid, self.decoder = (
-            onnxruntime.InferenceSession(g, options, providers=["CPUExecutionProvider"]) for g in (pyramid, decoder)
-        )
+
+def session(graph: bytes | str, threads: int = 2) -> onnxruntime.InferenceSession:
+    """A graph in ONNX Runtime."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+
+
+class Exported:
+    """The two graphs in ONNX Runtime, and the upsampler's if there is one."""
+
+    def __init__(self, pyramid: bytes | str, decoder: bytes | str, threads: int = 2, upsampler: bytes | str | None = None):
+        self.pyramid, self.decoder = session(pyramid, threads), session(decoder, threads)
+        self.upsampler = upsampler and session(upsampler, threads)
         self.names = [output.name for output in self.pyramid.get_outputs()]
 
     def features(self, image: np.ndarray) -> dict[str, np.ndarray]:
@@ -397,6 +426,11 @@ class Exported:
         features = {f"{frame}_{n}": f for frame, given in zip(FRAMES, (older, newer)) for n, f in given.items()}
         feed = {i.name: features[i.name] for i in self.decoder.get_inputs() if i.name != "scale"}
         return self.decoder.run(["flow", "uncertainty"], feed | {"scale": np.array(scale, np.float32)})
+
+    def full(self, image: np.ndarray, flow: np.ndarray, uncertainty: np.ndarray) -> list[np.ndarray]:
+        """Flow [1, H, W, 2] and expected error [1, H, W] by the upsampler, all in pixels of the network's input."""
+        feed = dict(zip(UpsamplerGraph.inputs, (image, flow, uncertainty)))
+        return self.upsampler.run(UpsamplerGraph.outputs, feed)
 
     def __call__(self, older: np.ndarray, newer: np.ndarray, scale=(1.0, 1.0)) -> list[np.ndarray]:
         return self.flow(self.features(older), self.features(newer), scale)
@@ -477,6 +511,45 @@ def manifest_entry(
     return "\n".join(lines) + "\n"
 
 
+def with_upsampler(entry: str, name: str, file: Path) -> str:
+    """The manifest's entry of a network with its upsampler, in place of one that it may have."""
+    parts = [part for part in entry.strip().split("\n[") if not part.startswith(f"{name}.upsampler]")]
+    golden = next(i for i, part in enumerate(parts) if part.startswith(f"{name}.golden]"))
+    sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
+    parts.insert(golden, f'{name}.upsampler]\nfile = "{file.name}"\nsha256 = "{sha256}"')
+    return "\n[".join(parts) + "\n"
+
+
+def held_entry(path: Path, name: str) -> str:
+    """A network's entry as the manifest has it."""
+    blocks = path.read_text().split("\n\n")
+    return next(block for block in blocks if not block.startswith("#") and name in tomllib.loads(block))
+
+
+@torch.no_grad()
+def export_upsampler(arguments: argparse.Namespace, state: dict) -> None:
+    """Writes, checks and enters the upsampler of a network that is in the manifest. It is not called as that network's graphs
+    are, for `checkpoints.of_graphs` reads those."""
+    network = Upsampled()
+    network.load_state_dict(state["mean"])
+    upsampler = rounded(network.upsampler.eval())
+    graph, file = upsampler_graph(upsampler), arguments.models / f"upsampler_{arguments.name.removeprefix('pwcnet_')}.onnx"
+    onnx.checker.check_model(graph)
+    file.write_bytes(graph.SerializeToString())
+    files = (str(arguments.models / f"{arguments.name}_{part}.onnx") for part in ("pyramid", "decoder"))
+    exported = Exported(*files, upsampler=str(file))
+    for height, width in ((128, 192), (256, 320), (512, 640)):
+        older, newer = moved(height, width, height)
+        given = exported(older, newer)
+        by_torch = UpsamplerGraph(upsampler)(*map(torch.from_numpy, (older, *given)))
+        worst = max(np.abs(found - wanted.numpy()).max() for found, wanted in zip(exported.full(older, *given), by_torch))
+        print(f"{height}x{width}: graph and PyTorch differ by at most {worst:.1e} px")
+        if worst > PARITY_PX:
+            raise SystemExit(f"{height}x{width}: expected a graph within {PARITY_PX} px of PyTorch, got {worst}")
+    manifest = arguments.models / "manifest.toml"
+    write_manifest(manifest, arguments.name, with_upsampler(held_entry(manifest, arguments.name), arguments.name, file))
+
+
 def write_manifest(path: Path, name: str, entry: str) -> None:
     """Puts one network's entry into the manifest and leaves the others as they are."""
     heading = "# Written by training/export.py. Golden inputs are given by formula there (golden_frames).\n"
@@ -493,7 +566,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path, help="folder of pieces, such as runs/fcdn/checkpoint")
     parser.add_argument("--name", default="pwcnet_fcdn")
-    parser.add_argument("--version", required=True, help="such as 2026-11-22.1")
+    parser.add_argument("--version", help="such as 2026-11-22.1; an upsampler has its network's")
     parser.add_argument("--models", type=Path, default=Path("../models"))
     parser.add_argument("--iterations", type=int, nargs="+", help="for RAFT-small: a network for each, as 8 4 12")
     parser.add_argument("--plain", action="store_true", help="only the two graphs of ONNX's own operators")
@@ -503,6 +576,10 @@ def main() -> None:
     state = checkpoints.load(arguments.checkpoint)
     if (state["kind"] == "raftsmall") != bool(arguments.iterations):
         raise SystemExit(f"{arguments.checkpoint}: holds a {state['kind']}; --iterations is for raftsmall, and needed there")
+    if state["kind"] == "upsampler":
+        return export_upsampler(arguments, state)
+    if not arguments.version:
+        raise SystemExit(f"{arguments.checkpoint}: holds a {state['kind']}, which needs a --version, such as 2026-11-22.1")
     arguments.models.mkdir(parents=True, exist_ok=True)
     if state["kind"] == "pwcnet":
         dense = state.get("dense", False)

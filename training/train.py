@@ -21,6 +21,7 @@ from networks import PwcNet
 from pairs import DARKEST, RECIPES, HeldOut, batch_of, levels
 from raft import RaftSmall
 from scenes import MIXTURE, Bank, Textures
+from upsampler import Upsampled
 
 JUDGED_LEVELS = (0, 10, 20, 30, 60)
 
@@ -32,9 +33,11 @@ def network_of(description: dict) -> nn.Module:
         return PwcNet(dense=description.get("dense", False))
     if kind == "raftsmall":
         return RaftSmall(description["iterations"])
+    if kind == "upsampler":
+        return Upsampled()
     if kind in KINDS:
         return KINDS[kind](description["width"])
-    raise ValueError(f"expected the network pwcnet, raftsmall, {' or '.join(KINDS)}, found {kind}")
+    raise ValueError(f"expected the network pwcnet, upsampler, raftsmall, {' or '.join(KINDS)}, found {kind}")
 
 
 def start(network: nn.Module, where: str) -> None:
@@ -283,7 +286,7 @@ def judged(network: nn.Module, held: HeldOut, bf16: bool) -> list[float]:
         for i in range(0, len(older), 4):
             with torch.autocast(older.device.type, torch.bfloat16, enabled=bf16):
                 flow, _ = network.weighed(network(older[i : i + 4], newer[i : i + 4])[0])[-1]
-            full = F.interpolate(flow, scale_factor=4, mode="bilinear", align_corners=False)
+            full = F.interpolate(flow, size=older.shape[-2:], mode="bilinear", align_corners=False)
             total += (full - held.flow[i : i + 4]).norm(dim=1).mean((1, 2)).sum().item()
         errors.append(total / len(older))
     return errors

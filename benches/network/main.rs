@@ -153,9 +153,12 @@ fn volume(shape: Shape, rounds: Rounds) -> Result<(), Error> {
     let mut graph = sliced::graph(shape)?;
     let (grid, offsets) = (sliced::grid(&shape, &flow), noise(6, 2 * shape.displacements()));
     let mut in_runtime = || {
-        let features = [1, channels, height, width];
-        let small = [(&grid[..], [1, height, width, 2]), (&offsets[..], [2, shape.displacements(), 1, 1])];
-        graph.run_on(&[(&older, features), (&newer, features), small[0], small[1]]).expect("the graph fits").1
+        let features = &[1, channels, height, width][..];
+        let (places, each) = ([1, height, width, 2], [2, shape.displacements(), 1, 1]);
+        graph
+            .run_on(&[(&older, features), (&newer, features), (&grid, &places), (&offsets, &each)])
+            .expect("the graph fits")
+            .1
     };
     let mut runtime = || drop(black_box(in_runtime()));
     let mut slices = || written_out(&shape, &older, &padded, &mut products, sliced_volume);

@@ -93,7 +93,11 @@ impl Method {
         let network = |name: &str, folder: Option<&Path>| {
             let models = folder.map_or_else(|| home(name, config), Path::to_path_buf);
             // The network itself is judged. What follows it in the node needs to know the camera's noise.
-            let (resolution, refine) = (Resolution::Full, false);
+            let resolution = match config.resolution {
+                Resolution::Bilinear => Resolution::Bilinear,
+                Resolution::Quarter | Resolution::Full => Resolution::Full,
+            };
+            let refine = false;
             let config = Config { network: name.into(), models, resolution, refine, ..config.clone() };
             Ok::<_, Error>(Way::Network(Box::new(Matcher::open(&config)?), 0))
         };

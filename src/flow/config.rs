@@ -11,8 +11,11 @@ pub enum Resolution {
     /// One vector for every 4 × 4 pixels of the developed image: what the network itself gives.
     #[default]
     Quarter,
-    /// One vector for every pixel of the developed image, by bilinear interpolation.
+    /// One vector for every pixel of the developed image: by the network's upsampler, which follows the image's edges (convex
+    /// upsampling, Teed and Deng 2020), or bilinear where the manifest has none for it.
     Full,
+    /// One vector for every pixel, always bilinear: what the network's cells know, to be compared.
+    Bilinear,
 }
 
 /// What computes the decoder's cost volumes.

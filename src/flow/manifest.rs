@@ -36,6 +36,8 @@ pub struct Entry {
     pub pyramid_bf16: Option<File>,
     /// The decoder with them, if there is one.
     pub decoder_bf16: Option<File>,
+    /// The graph that brings its flow to every pixel: see [`crate::flow::Resolution::Full`].
+    pub upsampler: Option<File>,
     /// Multiply-adds of all convolutions of a step, pyramid and decoder, at 320 × 256, in 10⁹; they grow with the area.
     pub gigamacs: Option<f64>,
     /// Fewer bits than 32 in which its end-point error was measured to stay within 2 % down the brightness ladder.

@@ -8,15 +8,17 @@ use crate::{
     clock::Stamp,
     exposure::{Exposed, Pair},
     flow::{
-        Config, Error, Flow, Grid, Lender, Resolution,
+        Canvas, Config, Error, Flow, Grid, Lender, Resolution,
         cores::{self, Pinned},
         golden::{self, Deviation},
+        manifest::File,
         network::{Model, Network, Raster, Slot},
         onnx::Onnx,
         padding::{self, Padded},
         pages::{Moved, Moving},
         priority,
         refine::Refiner,
+        upsampler::Upsampler,
     },
 };
 
@@ -29,7 +31,10 @@ const SIZES_MAX: usize = 16;
 pub struct Matcher {
     pub(crate) config: Config,
     network: Box<dyn Network>,
+    model: Model,
     refiner: Refiner,
+    /// For full resolution, where the network has one.
+    upsampler: Option<Upsampler>,
     /// Whose features each slot holds.
     described: [Option<Key>; 2],
     /// The network's raster, where it is not the one that was asked for.
@@ -79,6 +84,11 @@ impl Matcher {
         if config.golden_check {
             matcher.check_golden()?;
         }
+        if config.resolution == Resolution::Full {
+            matcher.upsampler = Upsampler::open(config)?;
+            let file = matcher.upsampler.as_ref().map(|upsampler| upsampler.file().clone());
+            matcher.model.sha256.extend(file.map(|File { file, sha256 }| (file, sha256)));
+        }
         Ok(matcher)
     }
 
@@ -86,7 +96,9 @@ impl Matcher {
     pub fn with(config: &Config, network: Box<dyn Network>) -> Self {
         Self {
             config: config.clone(),
+            model: network.model().clone(),
             network,
+            upsampler: None,
             refiner: Refiner::new(config.refine_narrow),
             described: [None; 2],
             flow: vec![],
@@ -99,7 +111,7 @@ impl Matcher {
 
     /// Which network runs.
     pub fn model(&self) -> &Model {
-        self.network.model()
+        &self.model
     }
 
     /// What was done so far.
@@ -124,7 +136,7 @@ impl Matcher {
         let [x, y] = exposed.scale;
         let (width, height) = (exposed.width, exposed.height);
         match self.config.resolution {
-            Resolution::Full => Grid { width, height, scale: [x, y] },
+            Resolution::Full | Resolution::Bilinear => Grid { width, height, scale: [x, y] },
             Resolution::Quarter => Grid {
                 width: (width / CELL).max(1),
                 height: (height / CELL).max(1),
@@ -143,7 +155,7 @@ impl Matcher {
         let _pinned = Pinned::to(&self.config.cores);
         let slot = self.describe_both(older, newer)?;
         let grid = self.grid(older);
-        let canvas = lender.lend(&grid);
+        let mut canvas = lender.lend(&grid);
         if canvas.flow.len() != 2 * grid.cells() || canvas.confidence.len() != grid.cells() {
             return Err(Error::Lent {
                 cells: grid.cells(),
@@ -172,20 +184,33 @@ impl Matcher {
             if self.config.refine {
                 self.refiner.refine(pair, columns, &mut self.flow, &mut self.uncertainty);
             }
-            confide(&mut self.uncertainty);
-            if self.config.resolution == Resolution::Quarter {
-                padding::crop(&self.flow, columns, canvas.flow, grid.width, 2);
-                padding::crop(&self.uncertainty, columns, canvas.confidence, grid.width, 1);
-            } else {
-                padding::enlarge(&self.flow, (columns, rows), canvas.flow, grid.width, 2);
-                padding::enlarge(&self.uncertainty, (columns, rows), canvas.confidence, grid.width, 1);
-            }
+            self.deliver(&padded, &grid, &mut canvas)?;
         }
         mask(pair, &grid, canvas.flow, canvas.confidence);
         self.settle([older.width, older.height]);
         let lender: &'a dyn Lender = lender;
         let (vectors, confidence) = lender.lent();
         Ok(Flow { older: older.stamp, newer: newer.stamp, grid, vectors, confidence })
+    }
+
+    /// Copies the network's raster to the lent memory, cut or enlarged.
+    fn deliver(&mut self, older: &Padded<'_>, grid: &Grid, canvas: &mut Canvas<'_>) -> Result<(), Error> {
+        let (columns, rows) = (older.width / CELL, older.height / CELL);
+        if let Some(upsampler) = &mut self.upsampler {
+            let raster = Raster { flow: &mut self.flow, uncertainty: &mut self.uncertainty };
+            upsampler.enlarge(older, &raster, grid, canvas)?;
+            confide(canvas.confidence);
+            return Ok(());
+        }
+        confide(&mut self.uncertainty);
+        if self.config.resolution == Resolution::Quarter {
+            padding::crop(&self.flow, columns, canvas.flow, grid.width, 2);
+            padding::crop(&self.uncertainty, columns, canvas.confidence, grid.width, 1);
+        } else {
+            padding::enlarge(&self.flow, (columns, rows), canvas.flow, grid.width, 2);
+            padding::enlarge(&self.uncertainty, (columns, rows), canvas.confidence, grid.width, 1);
+        }
+        Ok(())
     }
 
     /// After the first pair of a size all memory is taken, and goes to large pages, one with every pair.

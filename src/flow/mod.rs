@@ -27,6 +27,7 @@ mod refine;
 mod resized;
 pub mod runtime;
 mod trust;
+mod upsampler;
 pub mod wheel;
 pub mod winograd;
 

@@ -85,7 +85,7 @@ pub struct Model {
     pub name: String,
     /// Its version in the manifest.
     pub version: String,
-    /// sha256 of each of its files, by file name: the pyramid, then the decoder.
+    /// sha256 of each of its files, by file name: the pyramid, the decoder, and the upsampler if it runs.
     pub sha256: Vec<(String, String)>,
     /// What computes its cost volumes.
     pub operators: Operators,

@@ -1,5 +1,6 @@
 //! Flow: sizes, kept features, the real network through ONNX Runtime, and what is said when something is amiss.
 
+mod full;
 mod opening;
 
 use std::{
@@ -81,7 +82,7 @@ fn a_known_shift_comes_back_in_camera_pixels_at_every_size() {
             let flow = matcher.between(&pair(&older, &newer), &mut own).unwrap();
             let cells = match config.resolution {
                 Resolution::Quarter => ((width / 4).max(1), (height / 4).max(1)),
-                Resolution::Full => (width, height),
+                Resolution::Full | Resolution::Bilinear => (width, height),
             };
             let side = if config.resolution == Resolution::Quarter { 4.0 } else { 1.0 };
             let grid = Grid { width: cells.0, height: cells.1, scale: [4.0 * side, 3.0 * side] };

@@ -221,7 +221,7 @@ def test_committed_files_are_those_of_the_manifest(models):
     manifest = tomllib.loads((models / "manifest.toml").read_text())
     assert manifest
     for entry in manifest.values():
-        parts = ("pyramid", "decoder", "pyramid_fused", "fused", "pyramid_bf16", "decoder_bf16")
+        parts = ("pyramid", "decoder", "pyramid_fused", "fused", "pyramid_bf16", "decoder_bf16", "upsampler")
         paths = {part: models / entry[part]["file"] for part in parts if part in entry}
         for part, path in paths.items():
             assert hashlib.sha256(path.read_bytes()).hexdigest() == entry[part]["sha256"]

@@ -120,7 +120,7 @@ def test_every_description_makes_a_run(description):
         return
     known = tomllib.loads(description.read_text())
     leg = {"start"} if description.stem.endswith("_leg") else set()
-    own = {"pwcnet": {"start"}, "raftsmall": {"iterations", "start"}}.get(known["network"], {"width"} | leg)
+    own = {"pwcnet": {"start"}, "upsampler": {"start"}, "raftsmall": {"iterations", "start"}}.get(known["network"], {"width"} | leg)
     extra = {"dense", "darkest", "towards_bright", "displacements", "recipe", "bank", "shapes", "apart", "ahead", "only", "pixels", "graph"}
     assert set(known) - extra == set(DESCRIPTION) | own, "the same keys as every run"
     known.pop("start", None)

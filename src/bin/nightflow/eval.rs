@@ -105,6 +105,9 @@ struct How {
     /// What frames go through first: none, nlm, gaussian[:SIGMA], median[:SIDE], onnx:FILE (NCHW, 0…1, such as SID).
     #[arg(long, value_delimiter = ',', default_value = "none")]
     enhancers: Vec<Enhancer>,
+    /// Judge our networks by what their cells know, bilinear between them, without their upsamplers.
+    #[arg(long)]
+    bilinear: bool,
     /// The layout, where it can't be told from the folder: vbof, pairs, middlebury, sintel, kitti.
     #[arg(long, value_parser = kind)]
     layout: Option<Kind>,
@@ -243,7 +246,10 @@ fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, Str
             how.work.only.as_ref().map_or(String::new(), |t| format!(" named {t}"))
         );
     }
-    let config = flow::Config { threads: how.work.threads, ..launch::read(how.work.config.as_deref())?.flow };
+    let mut config = flow::Config { threads: how.work.threads, ..launch::read(how.work.config.as_deref())?.flow };
+    if how.bilinear {
+        config.resolution = flow::Resolution::Bilinear;
+    }
     let first = Judges::open(how, &config)?;
     let layout = KINDS.iter().find(|(_, known)| *known == kind).map_or("", |(name, _)| name);
     about.insert(0, ("data".into(), format!("{} ({layout}), {} pairs", folder.display(), items.len())));

@@ -64,8 +64,16 @@ pub fn run(args: Args) -> Result<Exit> {
         bail!("two sets are called {}; expected folders of different names", twice.1);
     }
     let (light, about) = args.night.light(&[Fault::None], None, args.draws)?;
-    let how =
-        How { models: args.models, enhancers: args.enhancers, layout: None, out: None, write: None, work: args.work };
+    let how = How {
+        models: args.models,
+        enhancers: args.enhancers,
+        // Few of these networks have an upsampler, and what is compared is what they were trained on.
+        bilinear: true,
+        layout: None,
+        out: None,
+        write: None,
+        work: args.work,
+    };
     let mut ended = Exit::Done;
     for (set, name) in args.sets.iter().zip(&names) {
         let report = evaluate(set, &light, &how, about.clone(), args.draws)?;
