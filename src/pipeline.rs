@@ -224,7 +224,7 @@ impl Back {
         laps.lap(Stage::Flow);
         let velocity = match state {
             State::Blind(_) => Err(Lack::Blind),
-            _ => self.motion.velocity(&flow, camera_size),
+            _ => self.motion.velocity_with(&flow, self.flow.gradients(), camera_size),
         };
         let integrated = self.motion.integrated(&flow, camera_size, matches!(state, State::Blind(_)));
         let obstacles = match (&mut self.lookout, &state) {

@@ -150,7 +150,7 @@ pub fn look(
         let (state, _) = matcher.judge(&pair, &flow);
         let blind = matches!(state, State::Blind(_));
         let size = flown.plan.size.map(|side| side as u32);
-        let velocity = if blind { Err(Lack::Blind) } else { odometer.velocity(&flow, size) };
+        let velocity = if blind { Err(Lack::Blind) } else { odometer.velocity_with(&flow, matcher.gradients(), size) };
         for (variant, lookout) in lookouts.iter_mut().enumerate() {
             let found = if blind { None } else { lookout.look(&odometer, &flow, size, pair.older, &velocity).ok() };
             if index >= WARM_UP || flown.plan.frames <= WARM_UP {

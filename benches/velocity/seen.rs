@@ -15,7 +15,7 @@ use nightflow::{
         noise::Noise,
     },
     exposure::Developer,
-    flow::{Flow, Grid, Matcher, Own, State},
+    flow::{Flow, Gradients, Grid, Matcher, Own, State},
 };
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
@@ -40,12 +40,21 @@ pub struct Step {
     pub vectors: Vec<f32>,
     /// As in [`Flow`].
     pub confidence: Vec<f32>,
+    /// The five planes of [`Gradients`], one after the other; empty where there are none.
+    pub gradients: Vec<f32>,
 }
 
 impl Step {
     /// The step as the odometer takes it.
     pub fn flow(&self, older: Stamp, newer: Stamp) -> Flow<'_> {
         Flow { older, newer, grid: self.grid, vectors: &self.vectors, confidence: &self.confidence }
+    }
+
+    /// What the frames' gradients say of it.
+    pub fn gradients(&self) -> Option<Gradients<'_>> {
+        let mut planes = self.gradients.chunks_exact(self.grid.cells().max(1));
+        let mut next = || planes.next();
+        Some(Gradients { information: [next()?, next()?, next()?], pull: [next()?, next()?] })
     }
 }
 
@@ -62,6 +71,7 @@ impl Step {
             grid: flow.grid,
             confidence: flow.vectors.as_chunks::<2>().0.iter().map(known).collect(),
             vectors: flow.vectors.clone(),
+            gradients: vec![],
         }
     }
 }
@@ -74,6 +84,8 @@ struct Kept {
     width: usize,
     height: usize,
     scale: [f32; 2],
+    /// Whether gradients are kept.
+    gradients: bool,
     /// Blindness and noise level, exposure by exposure.
     steps: Vec<Vec<(bool, Option<f32>)>>,
 }
@@ -201,12 +213,15 @@ fn look(
         let Some(pair) = developer.pair() else { continue };
         let flow = matcher.between(&pair, &mut own).map_err(|error| error.to_string())?;
         let (state, _) = matcher.judge(&pair, &flow);
+        let gradients =
+            matcher.gradients().map_or(vec![], |said| [said.information.concat(), said.pull.concat()].concat());
         steps.push(Step {
             blind: matches!(state, State::Blind(_)),
             noise_level: pair.newer.noise_level.unwrap_or(f32::NAN),
             grid: flow.grid,
             vectors: flow.vectors.to_vec(),
             confidence: flow.confidence.to_vec(),
+            gradients,
         });
     }
     Ok(steps)
@@ -216,24 +231,30 @@ fn pack(seen: &Seen) -> (Kept, Vec<u8>) {
     let grid = seen[0].first().map_or(Grid::default(), |step| step.grid);
     let known = |level: f32| level.is_finite().then_some(level);
     let of = |steps: &Vec<Step>| steps.iter().map(|step| (step.blind, known(step.noise_level))).collect();
-    let kept = Kept { width: grid.width, height: grid.height, scale: grid.scale, steps: seen.iter().map(of).collect() };
-    let values = seen.iter().flatten().flat_map(|step| step.vectors.iter().chain(&step.confidence));
+    let gradients = seen[0].first().is_some_and(|step| !step.gradients.is_empty());
+    let (width, height, scale) = (grid.width, grid.height, grid.scale);
+    let kept = Kept { width, height, scale, gradients, steps: seen.iter().map(of).collect() };
+    let values =
+        seen.iter().flatten().flat_map(|step| step.vectors.iter().chain(&step.confidence).chain(&step.gradients));
     (kept, values.flat_map(|value| value.to_le_bytes()).collect())
 }
 
 fn unpack(kept: &Kept, bytes: &[u8]) -> Seen {
     let grid = Grid { width: kept.width, height: kept.height, scale: kept.scale };
     let values: Vec<f32> = bytes.as_chunks::<4>().0.iter().map(|four| f32::from_le_bytes(*four)).collect();
-    let mut rest = values.chunks_exact(3 * grid.cells());
+    let mut rest = values.chunks_exact(if kept.gradients { 8 } else { 3 } * grid.cells());
     std::array::from_fn(|rung| {
         let step = |(blind, level): &(bool, Option<f32>)| {
-            let (vectors, confidence) = rest.next().map_or((&[][..], &[][..]), |step| step.split_at(2 * grid.cells()));
+            let step = rest.next().unwrap_or_default();
+            let (vectors, others) = step.split_at((2 * grid.cells()).min(step.len()));
+            let (confidence, gradients) = others.split_at(grid.cells().min(others.len()));
             Step {
                 blind: *blind,
                 noise_level: level.unwrap_or(f32::NAN),
                 grid,
                 vectors: vectors.to_vec(),
                 confidence: confidence.to_vec(),
+                gradients: gradients.to_vec(),
             }
         };
         kept.steps[rung].iter().map(step).collect()

@@ -83,7 +83,7 @@ pub fn judge(sensors: &Sensors, seen: &Seen, config: &Config) -> Result<Vec<Row>
                 taken.map_err(|error| error.to_string())?;
             }
             let size = sensors.plan.size.map(|side| side as u32);
-            let velocity = odometer.velocity(&step.flow(older, newer), size).ok();
+            let velocity = odometer.velocity_with(&step.flow(older, newer), step.gradients(), size).ok();
             let integrated = odometer.integrated(&step.flow(older, newer), size, false);
             let seconds = newer.seconds_since(older);
             let [moved, turned] = sensors.below(before + 1, seconds);

@@ -8,7 +8,7 @@ use crate::{
     clock::Stamp,
     exposure::{Exposed, Pair},
     flow::{
-        Canvas, Config, Error, Flow, Grid, Lender, Resolution,
+        Canvas, Config, Error, Flow, Gradients, Grid, Lender, Resolution,
         cores::{self, Pinned},
         golden::{self, Deviation},
         manifest::File,
@@ -33,6 +33,8 @@ pub struct Matcher {
     network: Box<dyn Network>,
     model: Model,
     refiner: Refiner,
+    /// Whether the newest vectors went through it.
+    refined: bool,
     /// For full resolution, where the network has one.
     upsampler: Option<Upsampler>,
     /// Whose features each slot holds.
@@ -100,6 +102,7 @@ impl Matcher {
             network,
             upsampler: None,
             refiner: Refiner::new(config.refine_narrow),
+            refined: false,
             described: [None; 2],
             flow: vec![],
             uncertainty: vec![],
@@ -164,15 +167,14 @@ impl Matcher {
             });
         }
         self.counts.pairs += 1;
+        self.refined = false;
         let padded = Padded::new(older, self.network.stride());
         let (columns, rows) = (padded.width / CELL, padded.height / CELL);
         if padded.is_whole() && self.config.resolution == Resolution::Quarter {
             let raster = Raster { flow: canvas.flow, uncertainty: canvas.confidence };
             self.network.between(slot, older.scale, raster)?;
             finite(canvas.flow, canvas.confidence)?;
-            if self.config.refine {
-                self.refiner.refine(pair, columns, canvas.flow, canvas.confidence);
-            }
+            self.refined = self.config.refine && self.refiner.refine(pair, columns, canvas.flow, canvas.confidence);
             confide(canvas.confidence);
         } else {
             self.counts.copied += 1;
@@ -181,9 +183,8 @@ impl Matcher {
             let raster = Raster { flow: &mut self.flow, uncertainty: &mut self.uncertainty };
             self.network.between(slot, older.scale, raster)?;
             finite(&self.flow, &self.uncertainty)?;
-            if self.config.refine {
-                self.refiner.refine(pair, columns, &mut self.flow, &mut self.uncertainty);
-            }
+            self.refined =
+                self.config.refine && self.refiner.refine(pair, columns, &mut self.flow, &mut self.uncertainty);
             self.deliver(&padded, &grid, &mut canvas)?;
         }
         mask(pair, &grid, canvas.flow, canvas.confidence);
@@ -191,6 +192,11 @@ impl Matcher {
         let lender: &'a dyn Lender = lender;
         let (vectors, confidence) = lender.lent();
         Ok(Flow { older: older.stamp, newer: newer.stamp, grid, vectors, confidence })
+    }
+
+    /// What the frames' gradients say of the newest flow, where it was refined and is at quarter resolution.
+    pub fn gradients(&self) -> Option<Gradients<'_>> {
+        (self.refined && self.config.resolution == Resolution::Quarter).then(|| self.refiner.said())
     }
 
     /// Copies the network's raster to the lent memory, cut or enlarged.

@@ -113,6 +113,17 @@ pub struct Flow<'a> {
     pub confidence: &'a [f32],
 }
 
+/// What the frames' own gradients say about the vectors of a flow, cell by cell of its raster and without what a network or a cell's
+/// neighbours say: a vector's logarithmic likelihood changes with a step s (camera pixels, right and down) by `pull`·s − ½ sᵀ·`information`·s.
+/// Zeros where they say nothing.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Gradients<'a> {
+    /// Fisher's information, xx, xy and yy, in 1/px².
+    pub information: [&'a [f32]; 3],
+    /// Right and down, in 1/px.
+    pub pull: [&'a [f32]; 2],
+}
+
 /// How far the flow of a step can be trusted.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub enum State {

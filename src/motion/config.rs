@@ -56,6 +56,8 @@ pub struct Config {
     pub confidence_min: f64,
     /// The most vectors that are looked at; the raster is thinned evenly.
     pub samples_max: usize,
+    /// Whether what the frames' gradients say in every cell has the last word on the velocity, where `[flow] refine` has them.
+    pub gradients: bool,
     /// The fewest vectors that must agree.
     pub inliers_min: u32,
     /// The least part of the vectors that must agree.
@@ -68,6 +70,8 @@ pub struct Config {
     pub flow_shared_sd_cells: f64,
     /// Flow error that all vectors of a step share, as a part of their length.
     pub flow_shared_sd_part: f64,
+    /// By how much an error that cells share may differ over the image where gradients have the last word, in such cells.
+    pub flow_bend_sd_cells: f64,
     /// How far the ground may be from a plane: by what part of the distance it bends where a ray's slope is 1.
     pub ground_bend_sd: f64,
     /// Clocks of gyro and camera that are further apart than this are said to be so.
@@ -145,12 +149,14 @@ impl Default for Config {
             grazing_cosine_min: 0.1,
             confidence_min: 0.05,
             samples_max: 1200,
+            gradients: true,
             inliers_min: 60,
             inlier_part_min: 0.25,
             seed_rad: 0.004,
             agree_rad_max: 0.015,
             flow_shared_sd_cells: 0.0005,
             flow_shared_sd_part: 0.001,
+            flow_bend_sd_cells: 0.002,
             ground_bend_sd: 0.05,
             clock_offset_s_max: 0.002,
             turn_scale_off_max: 0.1,
@@ -190,6 +196,11 @@ pub const REASONS: &[(&str, &str)] = &[
         "samples_max",
         "errors of neighbouring network cells are alike, so that more vectors cost time and add no knowledge",
     ),
+    (
+        "gradients",
+        "true: a vector is what many cells say, and counts like any other; cell by cell and by their texture the same frames say a fifth to a \
+         third more exactly how the camera moved and turned (models/velocity.md)",
+    ),
     ("inliers_min", "60 vectors give the three unknowns a margin of 40 equations each"),
     ("inlier_part_min", "where fewer than a quarter agree, another plane may be the larger one"),
     ("seed_rad", "one and a half pixels of the network's image at its usual field of view"),
@@ -200,6 +211,11 @@ pub const REASONS: &[(&str, &str)] = &[
          0.01 cells for vectors that [flow] refine = false leaves as the network gives them",
     ),
     ("flow_shared_sd_part", "the same bench, where the displacement is long; 0.005 without refining"),
+    (
+        "flow_bend_sd_cells",
+        "0.008 network pixels: what texture, interpolation and things that stand on the ground leave in good light, where noise leaves next to \
+         nothing (cargo bench --bench velocity, hovers)",
+    ),
     (
         "ground_bend_sd",
         "a bulge of 5 cm a metre beside the image's middle: lawns and roads bend less, heaps and ditches more",

@@ -1,7 +1,7 @@
 //! The robust fit of the displacement over distance, τ, to the flow vectors of one step; of the ground's normal too
 //! where nobody knows it.
 
-use nalgebra::{Matrix2x3, Matrix3, Matrix5, Matrix5x2, Matrix5x3, SMatrix, SVector, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix5, Matrix5x2, Matrix5x3, SMatrix, SVector, Vector2, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -14,6 +14,8 @@ use super::{
 pub(super) const CUT: f64 = 4.685;
 const ROUNDS: usize = 10;
 const GUESSES: usize = 64;
+/// From where the vectors agreed it is not far.
+const ROUNDS_OF_GRADIENTS: usize = 2;
 /// Guesses where the normal has to be guessed too.
 const GUESSES_OF_NORMAL: usize = 256;
 /// Rounds in which the normal is fitted; unlike τ it is not linear.
@@ -44,6 +46,15 @@ pub(super) struct Sight {
     pub(super) stretch: f64,
     pub(super) residual: [f64; 2],
     pub(super) agrees: bool,
+    /// What the frames' gradients say of the vector; where it stands, `weight` only says what is an outlier.
+    pub(super) said: Option<Said>,
+}
+
+/// A vector's likelihood by its cell's gradients, along the ray's x and y: see [`crate::flow::Gradients`].
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Said {
+    pub(super) information: Matrix2<f64>,
+    pub(super) pull: Vector2<f64>,
 }
 
 /// What is looked for.
@@ -106,14 +117,35 @@ impl Sight {
         (self.residual[0] * self.residual[0] + self.residual[1] * self.residual[1]).sqrt()
     }
 
-    /// Tukey's weight of the residual, 0…1.
-    pub(super) fn tukey(&self, spread: f64) -> f64 {
-        let part = self.weight * self.length().powi(2) / (CUT * spread).powi(2);
-        if part < 1.0 { (1.0 - part).powi(2) } else { 0.0 }
+    /// The square of the residual over that at which Tukey's weight ends.
+    fn part(&self, spread: f64) -> f64 {
+        self.weight * self.length().powi(2) / (CUT * spread).powi(2)
     }
 
-    /// Derivative of the weighted residual by the residual.
-    pub(super) fn tukey_slope(&self, spread: f64) -> SMatrix<f64, 2, 2> {
+    /// Tukey's weight of the residual, 0…1; of what gradients say, 1 where the vector agrees.
+    pub(super) fn tukey(&self, spread: f64) -> f64 {
+        match &self.said {
+            // In full or not at all: a vector's residual is its own noise in part, and what weighs the same noise by it would pass for
+            // knowing more.
+            Some(_) => f64::from(u8::from(self.agrees)),
+            None => (1.0 - self.part(spread)).max(0.0).powi(2),
+        }
+    }
+
+    /// What the vector pulls a motion by, on the ray's axes: its residual by its weight.
+    pub(super) fn pull(&self, spread: f64) -> Vector2<f64> {
+        let (residual, kept) = (Vector2::from(self.residual), self.tukey(spread));
+        match &self.said {
+            Some(said) => (said.pull + said.information * residual) * kept,
+            None => residual * (self.weight * kept),
+        }
+    }
+
+    /// Derivative of the pull by the residual; what gradients say is taken to keep its weight.
+    pub(super) fn pull_slope(&self, spread: f64) -> Matrix2<f64> {
+        if let Some(said) = &self.said {
+            return said.information * self.tukey(spread);
+        }
         let cut = (CUT * spread).powi(2);
         let part = self.weight * self.length().powi(2) / cut;
         if part >= 1.0 {
@@ -123,6 +155,16 @@ impl Sight {
         let bend = residual * residual.transpose() * (4.0 * (1.0 - part) * self.weight / cut);
         (SMatrix::identity() * (1.0 - part).powi(2) - bend) * self.weight
     }
+}
+
+/// The motion that most vectors agree on, and how well.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Agreed {
+    pub(super) motion: Motion,
+    /// Of a vector of weight 1, radians.
+    pub(super) spread: f64,
+    pub(super) samples: u32,
+    pub(super) inliers: u32,
 }
 
 /// What the fit found, in the older frame's optical axes. Where the normal was given, what concerns its lean is 0.
@@ -142,6 +184,8 @@ pub(super) struct Found {
     pub(super) by_normal: Matrix3<f64>,
     /// The turn that is left in the vectors, where they tell it apart from the motion.
     pub(super) leftover: Option<Leftover>,
+    /// Whether gradients had the last word.
+    pub(super) by_gradients: bool,
     pub(super) samples: u32,
     pub(super) inliers: u32,
     /// Root mean square of the length of those that agree, as they were seen: what an error of the network's that grows
@@ -165,7 +209,7 @@ pub(super) struct Fit {
 impl Fit {
     /// Fits τ to what stands in `sights`, and the normal's lean where it is not known better than `lean_sd`. The draws
     /// depend on `seed` alone.
-    pub(super) fn solve(&mut self, config: &Config, lean_sd: Option<f64>, seed: u64) -> Result<Found, Lack> {
+    pub(super) fn solve(&mut self, config: &Config, lean_sd: Option<f64>, seed: u64) -> Result<Agreed, Lack> {
         self.offered.clear();
         self.offered.extend((0u32..).zip(&self.sights).filter(|(_, sight)| sight.offered).map(|(i, _)| i));
         let samples = self.offered.len() as u32;
@@ -183,11 +227,36 @@ impl Fit {
         if inliers < needed {
             return Err(Lack::Disagreement { inliers, samples, needed });
         }
+        Ok(Agreed { motion, spread, samples, inliers })
+    }
+
+    /// What the vectors that agreed make of it.
+    pub(super) fn conclude(&mut self, agreed: &Agreed, lean_sd: Option<f64>) -> Option<Found> {
+        let Agreed { motion, spread, samples, inliers } = *agreed;
         let found = match lean_sd {
             None => self.linearise::<3>(&motion, spread, None),
             Some(_) => self.linearise::<5>(&motion, spread, lean_sd),
         };
-        found.map(|found| Found { samples, inliers, ..found }).ok_or(Lack::Degenerate)
+        found.map(|found| Found { samples, inliers, ..found })
+    }
+
+    /// What gradients make of it, whose cells stand in `sights`, from what the vectors agreed on; `None` where they say too little.
+    ///
+    /// A vector is what its cell and the cells around it say together, and all vectors count alike. Here every cell has its own word,
+    /// by its texture, along an edge nothing: the likelihood's maximum over the cells whose vectors agree.
+    pub(super) fn by_gradients(&mut self, agreed: &Agreed, config: &Config, lean_sd: Option<f64>) -> Option<Found> {
+        let mut agreed = *agreed;
+        self.residuals(&agreed.motion);
+        self.mark(agreed.spread, config);
+        for _ in 0..ROUNDS_OF_GRADIENTS {
+            let prior = lean_sd.map_or(0.0, |sd| self.likeness(agreed.spread) * self.unit(agreed.spread) / (sd * sd));
+            match lean_sd {
+                None => agreed.motion.add(&self.advance::<3>(&agreed.motion, agreed.spread, prior)?),
+                Some(_) => agreed.motion.add(&self.advance::<5>(&agreed.motion, agreed.spread, prior)?),
+            }
+            self.residuals(&agreed.motion);
+        }
+        self.conclude(&agreed, lean_sd).map(|found| Found { by_gradients: true, ..found })
     }
 
     /// Iteratively re-weighted least squares from a guess, and the spread that it ends with.
@@ -201,7 +270,7 @@ impl Fit {
         let mut motion = guess;
         let mut spread = self.measure(&motion, config, f64::INFINITY);
         for _ in 0..rounds {
-            let prior = lean_sd.map_or(0.0, |sd| self.likeness() * (spread / sd).powi(2));
+            let prior = lean_sd.map_or(0.0, |sd| self.likeness(spread) * (spread / sd).powi(2));
             let step = self.advance::<D>(&motion, spread, prior)?;
             motion.add(&step);
             spread = self.measure(&motion, config, CUT * spread);
@@ -265,11 +334,12 @@ impl Fit {
     fn advance<const D: usize>(&self, motion: &Motion, spread: f64, prior: f64) -> Option<SVector<f64, D>> {
         let (mut normal, mut right) = (SMatrix::<f64, D, D>::zeros(), SVector::<f64, D>::zeros());
         for sight in self.sights.iter().filter(|sight| sight.offered && sight.agrees) {
-            let weight = sight.weight * sight.tukey(spread);
-            if weight > 0.0 {
+            let kept = sight.tukey(spread);
+            if kept > 0.0 {
                 let rows = sight.rows::<D>(motion);
-                normal += rows.transpose() * rows * weight;
-                right += rows.transpose() * Vector2::from(sight.residual) * weight;
+                let by = sight.said.map_or(Matrix2::identity() * sight.weight, |said| said.information) * kept;
+                normal += rows.transpose() * by * rows;
+                right += rows.transpose() * sight.pull(spread);
             }
         }
         for axis in 3..D {
@@ -279,11 +349,16 @@ impl Fit {
         Some(linear::invert(&normal)? * right)
     }
 
+    /// Residuals under `motion`.
+    fn residuals(&mut self, motion: &Motion) {
+        self.sights.iter_mut().filter(|sight| sight.offered).for_each(|sight| sight.residual = sight.off(motion));
+    }
+
     /// Marks and counts the vectors that agree.
     fn mark(&mut self, spread: f64, config: &Config) -> u32 {
         let mut inliers = 0;
         for sight in self.sights.iter_mut().filter(|sight| sight.offered) {
-            sight.agrees = sight.tukey(spread) > 0.0 && sight.length() <= config.agree_rad_max;
+            sight.agrees = sight.part(spread) < 1.0 && sight.length() <= config.agree_rad_max;
             inliers += u32::from(sight.agrees);
         }
         inliers

@@ -59,16 +59,22 @@ impl Errors {
     }
 }
 
+/// What all vectors may err by together, radians: by one shift, and by what differs over the image as a turn does.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Alike {
+    pub(super) shared: f64,
+    pub(super) bent: f64,
+}
+
 impl Odometer {
-    /// From the fit's camera axes to the newer body axes, with everything that makes the velocity uncertain. `shared` is
-    /// what all vectors may err by together, radians.
+    /// From the fit's camera axes to the newer body axes, with everything that makes the velocity uncertain.
     pub(super) fn conclude(
         &mut self,
         turn: &Turn,
         ground: &Ground,
         found: &Found,
         span: Span,
-        shared: f64,
+        alike: Alike,
     ) -> Velocity {
         let forward = turn.rotation.inverse();
         let to_newer = forward.to_rotation_matrix() * self.mount;
@@ -91,8 +97,8 @@ impl Odometer {
             linear: camera - lever,
             arm,
         };
-        let errors = self.errors(turn, ground, found, span, &fitted, shared);
-        let (shift, mut covariance) = self.learn(&errors, found, span, &fitted, shared);
+        let errors = self.errors(turn, ground, found, span, &fitted, alike.shared);
+        let (shift, mut covariance) = self.learn(&errors, found, span, &fitted, alike.bent);
         let linear = fitted.linear - shift;
         let angular = turn.mean - errors.expected.angular;
         if turn.swing_variance.is_none() {
@@ -174,7 +180,7 @@ impl Odometer {
         found: &Found,
         span: Span,
         fit: &Fitted,
-        shared: f64,
+        bent: f64,
     ) -> (Vector3<f64>, Matrix6<f64>) {
         let mut covariance = errors.moved * errors.moved.transpose();
         let mut noise = covariance.fixed_view_mut::<3, 3>(0, 0);
@@ -183,7 +189,7 @@ impl Odometer {
         let Some(left) = found.leftover.as_ref().filter(|_| errors.count > PASSING) else { return (mean, covariance) };
         // Ground that is no plane bends the vectors by what it bends times the motion; and what all vectors share need
         // not be the same all over the image.
-        let bend = (self.config.ground_bend_sd * found.tau.norm()).powi(2) + shared * shared;
+        let bend = (self.config.ground_bend_sd * found.tau.norm()).powi(2) + bent * bent;
         let total = errors.seen * errors.seen.transpose() + left.covariance + Matrix3::identity() * bend;
         let Some(inverse) = total.try_inverse() else { return (mean, covariance) };
         let surprise = left.angle - errors.expected.seen;

@@ -1,7 +1,7 @@
 //! How the fit's result changes with whatever is uncertain, to first order: residuals and how alike they are, the turn, a
 //! shift of all vectors, the normal.
 
-use nalgebra::{Matrix3, Matrix3x2, Matrix5, Matrix5x2, Matrix5x3, SMatrix, SVector, Vector2, Vector3};
+use nalgebra::{Matrix3, Matrix3x2, Matrix5, Matrix5x2, Matrix5x3, SMatrix, SVector, Vector3};
 
 use super::fit::{Fit, Found, Motion, Sight};
 
@@ -64,9 +64,9 @@ impl<const D: usize> Sums<D> {
         };
         for sight in sights {
             let (rows, turned) = (sight.rows::<D>(motion), sight.turned());
-            let by = sight.tukey_slope(spread);
+            let by = sight.pull_slope(spread);
             let (bent, bent_turn) = (rows.transpose() * by, turned.transpose() * by);
-            let weighted = Vector2::from(sight.residual) * (sight.weight * sight.tukey(spread));
+            let weighted = sight.pull(spread);
             let pull: SVector<f64, D> = rows.transpose() * weighted;
             let pull_turn = turned.transpose() * weighted;
             let slanted = sight.per_slope(&motion.tau) * Vector3::new(sight.older[0], sight.older[1], 1.0).transpose();
@@ -88,18 +88,11 @@ impl<const D: usize> Sums<D> {
     }
 
     /// The turn that is left, where the motion is fitted beside it; `inverse` is that of `slope`.
-    fn leftover(
-        &self,
-        inverse: &SMatrix<f64, D, D>,
-        tau: &Vector3<f64>,
-        likeness: f64,
-        spread: f64,
-    ) -> Option<Leftover> {
+    fn leftover(&self, inverse: &SMatrix<f64, D, D>, tau: &Vector3<f64>, variance: f64) -> Option<Leftover> {
         let by_turn = inverse * self.by_turn;
         let apart = self.slope_turn - self.by_turn.transpose() * by_turn;
         let (moving, still) = invert(&apart).zip(invert(&self.slope_turn))?;
         let moved = self.by_turn.fixed_view::<3, 3>(0, 0).transpose() * tau;
-        let variance = likeness * spread * spread;
         let both = self.noise_both - self.noise * by_turn;
         let noise = self.noise_turn - self.noise_both.transpose() * by_turn - by_turn.transpose() * both;
         let with_motion = inverse * both * moving;
@@ -127,19 +120,20 @@ impl Fit {
     ) -> Option<Found> {
         let agreed = self.sights.iter().filter(|sight| sight.offered && sight.agrees);
         let mut sums = Sums::<D>::over(agreed, motion, spread);
-        let likeness = unfitted(self.likeness(), sums.count, D);
+        let likeness = unfitted(self.likeness(spread), sums.count, D);
+        let unit = self.unit(spread);
         sums.noise *= likeness;
         sums.noise_turn *= likeness;
         sums.noise_both *= likeness;
         if let Some(sd) = lean_sd {
-            let prior = likeness * (spread / sd).powi(2);
+            let prior = likeness * unit / (sd * sd);
             for axis in 3..D {
                 sums.slope[(axis, axis)] += prior;
                 sums.noise[(axis, axis)] += (prior * sd).powi(2);
             }
         }
         let inverse = invert(&sums.slope)?;
-        let leftover = sums.leftover(&inverse, &motion.tau, likeness, spread);
+        let leftover = sums.leftover(&inverse, &motion.tau, likeness * unit);
         let found = inverse * sums.noise * inverse.transpose();
         let (by_turn, by_shift, by_normal) =
             (inverse * sums.by_turn, inverse * sums.by_shift, inverse * sums.by_normal);
@@ -152,6 +146,7 @@ impl Fit {
             by_shift: Matrix5x2::from_fn(|i, j| if i < D { by_shift[(i, j)] } else { 0.0 }),
             by_normal: Matrix3::from_fn(|i, j| if given { by_normal[(i, j)] } else { 0.0 }),
             leftover,
+            by_gradients: false,
             samples: 0,
             inliers: 0,
             stretch: (sums.stretch / f64::max(sums.count, 1.0)).sqrt(),
@@ -159,13 +154,28 @@ impl Fit {
     }
 
     /// How many vectors stand for one independent vector.
-    pub(super) fn likeness(&mut self) -> f64 {
+    pub(super) fn likeness(&mut self, spread: f64) -> f64 {
         self.scaled.clear();
-        self.scaled.extend(self.sights.iter().map(|sight| match sight.offered && sight.agrees {
-            true => sight.residual.map(|off| off * sight.weight.sqrt()),
-            false => [f64::NAN; 2],
+        self.scaled.extend(self.sights.iter().map(|sight| match (sight.offered && sight.agrees, &sight.said) {
+            (true, None) => sight.residual.map(|off| off * sight.weight.sqrt()),
+            // As it is: it is the strong ones that count, and that must not be alike.
+            (true, Some(_)) => sight.pull(spread).into(),
+            (false, _) => [f64::NAN; 2],
         }));
         likeness(&self.scaled, self.columns)
+    }
+
+    /// The variance of a residual over what its weight says: for vectors the spread's square, for what gradients say, which know their own
+    /// noise, by how much the square of a pull is more than the information.
+    pub(super) fn unit(&self, spread: f64) -> f64 {
+        let (mut squares, mut expected) = (0.0, 0.0);
+        for sight in self.sights.iter().filter(|sight| sight.offered && sight.agrees) {
+            if let Some(said) = &sight.said {
+                squares += sight.pull(spread).norm_squared();
+                expected += said.information.trace();
+            }
+        }
+        if expected > 0.0 { squares / expected } else { spread * spread }
     }
 }
 

@@ -22,6 +22,7 @@ pub mod obstacles;
 mod odometer;
 mod plane;
 mod quality;
+mod sights;
 
 pub use config::{AttitudeUse, Config, GyroUse, Mount, REASONS};
 pub use drift::{Diagnosis, Drift};

@@ -6,17 +6,19 @@ use super::{
     AttitudeUse, Config, Diagnosis, Drift, Error, GyroUse, Lack, Mount, NoDistance, Velocity,
     bias::Bias,
     drift::{Turned, Watch},
-    fit::{Fit, Found, Sight},
+    fit::{Fit, Found},
+    fusion::Alike,
     ground::Ranges,
     gyro::{Rates, Turn},
     lens::Lens,
     mounting::Mounting,
     obstacles::Sighting,
     plane::Plane,
+    sights::Rays,
 };
 use crate::{
     clock::Stamp,
-    flow::{Flow, Grid},
+    flow::{Flow, Gradients},
     wire::{CameraInfo, Imu, Range, TfMessage},
 };
 
@@ -36,12 +38,14 @@ pub struct Odometer {
     /// Where the transforms are to say how the camera sits, and whether they did.
     mounting: Option<Mounting>,
     pub(super) mounted: bool,
-    /// Rays of the raster's cells, row by row, and the raster that they belong to: they change with the calibration only.
-    rays: Vec<Option<[f64; 2]>>,
-    rays_of: Option<Grid>,
+    /// Every second cell or so, as many as are looked at, and all of them.
+    pub(super) thinned: Rays,
+    pub(super) whole: Rays,
     pub(super) rates: Rates,
     ranges: Ranges,
-    fit: Fit,
+    pub(super) fit: Fit,
+    /// What gradients say, of every cell.
+    pub(super) every: Fit,
     pub(super) plane: Plane,
     watch: Watch,
     pub(super) bias: Bias,
@@ -106,11 +110,12 @@ impl Odometer {
             lens: None,
             mounting: (config.camera == Mount::Tf).then(Mounting::default),
             mounted: config.camera != Mount::Tf,
-            rays: Vec::new(),
-            rays_of: None,
+            thinned: Rays::default(),
+            whole: Rays::default(),
             rates: Rates::new(imu),
             ranges: Ranges::new(),
             fit: Fit::default(),
+            every: Fit::default(),
             plane: Plane::default(),
             watch: Watch::default(),
             bias: Bias::default(),
@@ -147,7 +152,7 @@ impl Odometer {
         let lens = Lens::read(info)?;
         if self.lens != lens {
             self.lens = lens;
-            self.rays_of = None;
+            (self.thinned, self.whole) = Default::default();
         }
         if self.mounting.as_mut().is_some_and(|mounting| mounting.camera(&info.header.frame_id)) {
             self.mount();
@@ -190,25 +195,40 @@ impl Odometer {
 
     /// The body's velocity by the flow between two frames of `camera_size` (columns, rows).
     pub fn velocity(&mut self, flow: &Flow<'_>, camera_size: [u32; 2]) -> Result<Velocity, Lack> {
+        self.velocity_with(flow, None, camera_size)
+    }
+
+    /// The same, with the frames' gradients at hand: they know more than the vectors, each of which is made of many cells' words.
+    pub fn velocity_with(
+        &mut self,
+        flow: &Flow<'_>,
+        gradients: Option<Gradients<'_>>,
+        camera_size: [u32; 2],
+    ) -> Result<Velocity, Lack> {
         let focal = self.lens(camera_size)?.focal();
         let span = self.span(flow);
         if span.seconds <= 0.0 {
             return Err(Lack::Degenerate);
         }
-        let constant = self.config.flow_shared_sd_cells * f64::from(flow.grid.scale[0]) / focal;
+        let cell = f64::from(flow.grid.scale[0]) / focal;
         let turn = self.turn(span)?;
         let mut ground = self.ground(span);
         self.look(flow, &turn, &ground);
         let seed = u64::from(self.config.seed) ^ flow.older.ns().cast_unsigned();
-        let found = self.fit.solve(&self.config, ground.lean_sd, seed)?;
+        let agreed = self.fit.solve(&self.config, ground.lean_sd, seed)?;
+        let heard = gradients.filter(|_| self.config.gradients);
+        let found = heard.and_then(|gradients| self.hear(flow, &gradients, &agreed, &turn, &ground));
+        let found = found.or_else(|| self.fit.conclude(&agreed, ground.lean_sd)).ok_or(Lack::Degenerate)?;
         self.compare(&turn, &found, span);
+        let constant = self.config.flow_shared_sd_cells * cell;
         let shared = (constant.powi(2) + (self.config.flow_shared_sd_part * found.stretch).powi(2)).sqrt();
+        let bent = if found.by_gradients { shared.hypot(self.config.flow_bend_sd_cells * cell) } else { shared };
         if ground.lean_sd.is_some() {
             let [a, b] = ground.tangents;
             ground.normal = (ground.normal + a * found.lean[0] + b * found.lean[1]).normalize();
             ground.distance = self.distance(span, &ground.normal);
         }
-        let velocity = self.conclude(&turn, &ground, &found, span, shared);
+        let velocity = self.conclude(&turn, &ground, &found, span, Alike { shared, bent });
         Ok(Velocity { older: flow.older, newer: flow.newer, ..velocity })
     }
 
@@ -325,56 +345,6 @@ impl Odometer {
             swing_variance,
             interval_s: span.seconds,
         });
-    }
-
-    /// Fills the fit's raster: rays of both ends of each vector, the turn taken off.
-    fn look(&mut self, flow: &Flow<'_>, turn: &Turn, ground: &Ground) {
-        let Some(lens) = &self.lens else { return };
-        let grid = flow.grid;
-        let mut step = 1;
-        while grid.width.div_ceil(step) * grid.height.div_ceil(step) > self.config.samples_max {
-            step += 1;
-        }
-        let middle = |i: usize, scale: f32| (i as f64 + 0.5) * f64::from(scale) - 0.5;
-        let columns = || (step / 2..grid.width.max(step / 2 + 1)).step_by(step);
-        let rows = || (step / 2..grid.height.max(step / 2 + 1)).step_by(step);
-        if self.rays_of.replace(grid) != Some(grid) {
-            self.rays.clear();
-            let pixel = |row, column| [middle(column, grid.scale[0]), middle(row, grid.scale[1])];
-            self.rays.extend(rows().flat_map(|row| columns().map(move |column| lens.ray(pixel(row, column)))));
-        }
-        let back = self.mount.inverse() * turn.rotation.to_rotation_matrix() * self.mount;
-        let normal = self.mount.inverse() * ground.normal;
-        let leans = ground.lean_sd.map(|_| ground.tangents.map(|tangent| self.mount.inverse() * tangent));
-        let sight = |column: usize, row: usize, older: Option<[f64; 2]>| -> Option<Sight> {
-            let cell = row * grid.width + column;
-            let confidence = f64::from(*flow.confidence.get(cell)?);
-            let vector = flow.vectors.get(2 * cell..2 * cell + 2)?;
-            let usable = confidence >= self.config.confidence_min && vector.iter().all(|v| v.is_finite());
-            if !usable {
-                return None;
-            }
-            let older = older?;
-            let [x, y] = [middle(column, grid.scale[0]), middle(row, grid.scale[1])];
-            let newer = lens.ray([x + f64::from(vector[0]), y + f64::from(vector[1])])?;
-            let ray = Vector3::new(older[0], older[1], 1.0);
-            let slope = normal.dot(&ray);
-            let turned = back * Vector3::new(newer[0], newer[1], 1.0);
-            if slope < self.config.grazing_cosine_min * ray.norm() || turned.z < 0.1 {
-                return None;
-            }
-            // A probability p of being right to within a pixel is a Gaussian of variance −1 / (2 ln(1 − p)) px².
-            let weight = -2.0 * (1.0 - confidence.min(0.999)).ln();
-            let stretch = ((newer[0] - older[0]).powi(2) + (newer[1] - older[1]).powi(2)).sqrt();
-            let newer = [turned.x / turned.z, turned.y / turned.z];
-            let lean = leans.map_or([0.0; 2], |leans| leans.map(|lean| lean.dot(&ray)));
-            Some(Sight { older, newer, slope, lean, weight, stretch, offered: true, ..Sight::default() })
-        };
-        self.fit.columns = columns().count();
-        self.fit.sights.clear();
-        let cells = rows().flat_map(|row| columns().map(move |column| (column, row)));
-        let sights = cells.zip(&self.rays).map(|((column, row), ray)| sight(column, row, *ray).unwrap_or_default());
-        self.fit.sights.extend(sights);
     }
 }
 

@@ -1,6 +1,7 @@
 //! Velocity from flow over a plane: exact where the flow is, honest where it is not, and silent where it must be.
 
 mod bias;
+mod gradients;
 mod lens;
 mod watch;
 

@@ -4,7 +4,7 @@ use nightflow::{
     clock::Stamp,
     darkness::noise::Normals,
     exposure::{Exposed, Noise, Pair},
-    flow::{Config, Error, Fake, Flow, Matcher, Model, Network, Own, Raster, Slot, padding::Padded},
+    flow::{Config, Error, Fake, Flow, Matcher, Model, Network, Own, Raster, Resolution, Slot, padding::Padded},
 };
 
 const SIZE: [usize; 2] = [128, 96];
@@ -179,4 +179,69 @@ fn an_edge_between_two_motions_stays_where_it_is() {
         let error = off(&vectors, truth, far);
         assert!(error < 0.1, "{error:.3} px of 1 are left away from the edge");
     }
+}
+
+/// The step from a cell's vector to the truth that all gradients together ask for, pixels, and by how much noise may have moved it.
+fn asked(noise: f64, truth: [f32; 2], said: [f32; 2]) -> ([f64; 2], f64) {
+    let older = frame(1, noise / 255.0, texture);
+    let [u, v] = truth.map(f64::from);
+    let newer = frame(2, noise / 255.0, |x, y, colour| texture(x - u, y - v, colour));
+    let config = Config { refine: true, ..Config::default() };
+    let mut matcher = Matcher::with(&config, Box::new(Fake::shift(said[0], said[1]).with_uncertainty(0.6)));
+    let mut own = Own::default();
+    let pair = Pair { older: &older, newer: &newer, gain_step: None };
+    let vectors = matcher.between(&pair, &mut own).unwrap().vectors.to_vec();
+    let gradients = matcher.gradients().expect("it was refined");
+    let [xx, xy, yy] = gradients.information;
+    let [width, height] = SIZE.map(|side| side / 4);
+    let (mut known, mut pull) = ([0.0f64; 3], [0.0f64; 2]);
+    for cell in 0..width * height {
+        if !(2..width - 2).contains(&(cell % width)) || !(2..height - 2).contains(&(cell / width)) {
+            continue;
+        }
+        // Camera pixels are half as wide.
+        let off = [0, 1].map(|axis| f64::from(2.0 * truth[axis] - vectors[2 * cell + axis]));
+        let information = [xx, xy, yy].map(|plane| f64::from(plane[cell]));
+        pull[0] += f64::from(gradients.pull[0][cell]) - information[0] * off[0] - information[1] * off[1];
+        pull[1] += f64::from(gradients.pull[1][cell]) - information[1] * off[0] - information[2] * off[1];
+        known = [0, 1, 2].map(|at| known[at] + information[at]);
+    }
+    let determinant = known[0] * known[2] - known[1] * known[1];
+    let step = [
+        (known[2] * pull[0] - known[1] * pull[1]) / determinant / 2.0,
+        (known[0] * pull[1] - known[1] * pull[0]) / determinant / 2.0,
+    ];
+    (step, 0.5 * (known[0].min(known[2])).recip().sqrt())
+}
+
+#[test]
+fn the_gradients_of_all_cells_together_ask_for_the_truth() {
+    for (noise, bound) in [(0.0, 0.012), (20.0, 0.03), (60.0, 0.12)] {
+        for truth in [[0.3f32, -0.45], [-3.75, 0.5]] {
+            let ([right, down], sd) = asked(noise, truth, [truth[0] + 0.4, truth[1] - 0.3]);
+            println!("noise {noise}, shift {truth:?}: {right:.4} and {down:.4} px off, {sd:.4} by noise");
+            assert!(right.hypot(down) < bound, "noise {noise}, shift {truth:?}: {right:.4} and {down:.4} px off");
+        }
+    }
+}
+
+#[test]
+fn gradients_say_nothing_of_a_flat_image_and_are_not_there_unless_it_is_refined() {
+    let (older, newer) = (frame(1, 0.0, |_, _, _| 0.4), frame(2, 0.0, |_, _, _| 0.4));
+    let pair = Pair { older: &older, newer: &newer, gain_step: None };
+    let mut own = Own::default();
+    let mut matcher = |refine, resolution| {
+        let config = Config { refine, resolution, ..Config::default() };
+        let mut matcher = Matcher::with(&config, Box::new(Fake::shift(0.7, -0.3)));
+        assert!(matcher.gradients().is_none(), "there was no pair yet");
+        matcher.between(&pair, &mut own).unwrap();
+        matcher
+    };
+    let flat = matcher(true, Resolution::Quarter);
+    let said = flat.gradients().expect("it was refined");
+    let planes = said.information.iter().chain(&said.pull);
+    assert!(planes.clone().all(|plane| plane.len() == SIZE[0] / 4 * SIZE[1] / 4));
+    assert!(planes.flat_map(|plane| plane.iter()).all(|value| value.abs() < 1e-6));
+    assert!(matcher(false, Resolution::Quarter).gradients().is_none());
+    assert!(matcher(true, Resolution::Full).gradients().is_none(), "they stand on another raster");
 }

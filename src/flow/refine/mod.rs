@@ -19,13 +19,16 @@
 //!   than before keeps the network's vector.
 
 mod pyramid;
+mod said;
 mod sums;
 
 use crate::{
     clock::Stamp,
     exposure::{Exposed, Pair},
+    flow::Gradients,
 };
 use pyramid::{Found, Level, Sums};
+use said::Said;
 
 /// Pixels of the developed image in a cell, along either side.
 const CELL: usize = 4;
@@ -64,6 +67,7 @@ pub(super) struct Refiner {
     narrow: bool,
     column: Sums,
     levels: Vec<Level>,
+    said: Said,
 }
 
 /// A frame's grey, blurred.
@@ -102,11 +106,17 @@ impl Refiner {
         Self { narrow, ..Self::default() }
     }
 
-    /// Moves the vectors of `flow` (in camera pixels, on a raster of `columns`) and lowers their expected errors.
-    pub(super) fn refine(&mut self, pair: &Pair<'_>, columns: usize, flow: &mut [f32], uncertainty: &mut [f32]) {
+    /// Moves the vectors of `flow` (in camera pixels, on a raster of `columns`) and lowers their expected errors. Says whether it did.
+    pub(super) fn refine(
+        &mut self,
+        pair: &Pair<'_>,
+        columns: usize,
+        flow: &mut [f32],
+        uncertainty: &mut [f32],
+    ) -> bool {
         let size = [pair.older.width, pair.older.height];
         if size[0].min(size[1]) < SIDE_MIN {
-            return;
+            return false;
         }
         self.look(pair);
         let raster = [size[0] / CELL, size[1] / CELL];
@@ -132,6 +142,13 @@ impl Refiner {
             pyramid::descend(&mut self.levels, &self.window, columns, &mut self.found);
         }
         self.conclude(raster, columns, pair.older.scale, flow, uncertainty);
+        self.said.take(&self.cells, &self.found, &self.before, pair.older.scale);
+        true
+    }
+
+    /// What the gradients say of the vectors that were refined last, on a raster of whole cells of the frame.
+    pub(super) fn said(&self) -> Gradients<'_> {
+        self.said.told()
     }
 
     /// The grey of both frames; the newer one of a pair is the older one of the next.

@@ -33,9 +33,6 @@ pub(super) struct Sums {
     line: Vec<f32>,
 }
 
-const MISFIT: usize = 5;
-const COUNT: usize = 7;
-
 impl Sums {
     pub(super) const PLANES: usize = 9;
     /// Those that are summed from pixels.
@@ -50,6 +47,12 @@ impl Sums {
         self.width * self.height
     }
 
+    /// In their order.
+    pub(super) fn all(&self) -> [&[f32]; Self::PLANES] {
+        let mut planes = self.planes.chunks_exact(self.cells());
+        std::array::from_fn(|_| planes.next().unwrap_or_default())
+    }
+
     /// Takes a row of cells from its pixels' products, plane by plane.
     pub(super) fn fold(&mut self, row: usize, products: &[f32]) {
         let (width, cells) = (self.width, self.cells());
@@ -60,8 +63,8 @@ impl Sums {
 
     /// Mean squared difference over what noise lets expect, cell by cell; NaN where there is none.
     pub(super) fn misfits(&self) -> impl Iterator<Item = f32> {
-        let plane = |plane: usize| &self.planes[plane * self.cells()..][..self.cells()];
-        plane(MISFIT).iter().zip(plane(COUNT)).map(|(misfit, count)| misfit / count)
+        let [.., misfits, _, counts, _] = self.all();
+        misfits.iter().zip(counts).map(|(misfit, count)| misfit / count)
     }
 }
 
@@ -292,9 +295,7 @@ fn widen_row(near: &[f32], far: &[f32], out: &mut [f32]) {
 
 /// The correction of each window by its own sums and by what is there, which is what is known beforehand.
 fn settle(sums: &Sums, part: f32, found: &mut Found) {
-    let mut planes = sums.planes.chunks_exact(sums.cells());
-    let sums = std::array::from_fn(|_| planes.next().unwrap_or_default());
-    settle_planes(sums, part, found.planes_mut().map(Vec::as_mut_slice));
+    settle_planes(sums.all(), part, found.planes_mut().map(Vec::as_mut_slice));
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl", "x86_64+avx2", "aarch64+neon"))]
