@@ -246,10 +246,7 @@ fn evaluate(folder: &Path, light: &Light, how: &How, mut about: Vec<(String, Str
             how.work.only.as_ref().map_or(String::new(), |t| format!(" named {t}"))
         );
     }
-    let mut config = flow::Config { threads: how.work.threads, ..launch::read(how.work.config.as_deref())?.flow };
-    if how.bilinear {
-        config.resolution = flow::Resolution::Bilinear;
-    }
+    let config = how.settings()?;
     let first = Judges::open(how, &config)?;
     let layout = KINDS.iter().find(|(_, known)| *known == kind).map_or("", |(name, _)| name);
     about.insert(0, ("data".into(), format!("{} ({layout}), {} pairs", folder.display(), items.len())));
@@ -312,6 +309,15 @@ fn gathered(mut whole: Report, parts: impl Iterator<Item = Report>) -> Report {
         whole.skipped.extend(part.skipped);
     }
     whole
+}
+
+impl How {
+    /// With what networks are computed.
+    fn settings(&self) -> Result<flow::Config> {
+        let read = launch::read(self.work.config.as_deref())?.flow;
+        let resolution = if self.bilinear { flow::Resolution::Bilinear } else { read.resolution };
+        Ok(flow::Config { threads: self.work.threads, resolution, ..read })
+    }
 }
 
 /// What a worker judges and what it puts before it.

@@ -55,7 +55,8 @@ fn what_all_vectors_lack_is_made_good() {
     let said = Said::of(&short, &exact.vectors, |_| Matrix2::identity() * 4.0);
     let [plain, heard] = [None, Some(&said)].map(|said| off(&truth, &velocity(&truth, &short, said).unwrap()));
     assert!(plain > 0.1, "a tenth of the speed is missing: {plain}");
-    assert!(heard < 1e-4, "{heard} m/s off");
+    // Rays are taken at the vectors as they are, which matters to second order.
+    assert!(heard < 0.005 * plain, "{heard} m/s off");
 }
 
 #[test]
