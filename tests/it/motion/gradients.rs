@@ -151,6 +151,7 @@ fn the_covariance_is_that_of_the_cells_own_noise() {
     }
     let mean = sum / DRAWS as f64;
     println!("normalised error squared over its degrees of freedom: {mean:.3}");
-    // A little more is said than there is: how alike errors are is never taken for less than not at all.
-    assert!((0.7..=1.25).contains(&mean), "{mean}");
+    // More is said than there is: these cells know their information, those of frames do not, which counts for 15 %; and how alike errors
+    // are is never taken for less than not at all.
+    assert!((0.6..=1.25).contains(&mean), "{mean}");
 }
