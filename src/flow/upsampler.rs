@@ -68,16 +68,22 @@ impl Upsampler {
             (&self.flow, &[1, rows, columns, 2]),
             (raster.uncertainty, &[1, rows, columns]),
         ];
-        let mut strange = None;
-        self.graph.run_into(&tensors, |at, shape, values| match (at, shape) {
-            (0, [1, h, w, 2]) if [*h, *w] == [height as i64, width as i64] => {
-                padding::crop(values, width, canvas.flow, grid.width, 2);
+        let (mut strange, mut given) = (None, 0);
+        self.graph.run_into(&tensors, |at, shape, values| {
+            given += 1;
+            match (at, shape) {
+                (0, [1, h, w, 2]) if [*h, *w] == [height as i64, width as i64] => {
+                    padding::crop(values, width, canvas.flow, grid.width, 2);
+                }
+                (1, [1, h, w]) if [*h, *w] == [height as i64, width as i64] => {
+                    padding::crop(values, width, canvas.confidence, grid.width, 1);
+                }
+                _ => strange = Some(format!("output {at} of {shape:?}")),
             }
-            (1, [1, h, w]) if [*h, *w] == [height as i64, width as i64] => {
-                padding::crop(values, width, canvas.confidence, grid.width, 1);
-            }
-            _ => strange = Some(format!("output {at} of {shape:?}")),
         })?;
+        if given < 2 {
+            strange = Some(format!("{given} outputs"));
+        }
         if let Some(found) = strange {
             let wanted = format!("outputs of [1, {height}, {width}, 2] and [1, {height}, {width}]");
             return Err(Error::Interface { file: self.file.file.clone(), wanted, found });

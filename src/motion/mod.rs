@@ -4,7 +4,8 @@
 //! integrated over exactly the interval, turns m₂ back into the older frame's axes: p₂. With n the unit vector to the
 //! ground, d the distance along it and t the camera's displacement, τ = t/d obeys
 //! x₂ − x₁ = (n·m₁)(−τ_x + x₂ τ_z) and the same in y: exact, and linear in τ. A seeded RANSAC starts the fit, and
-//! iteratively re-weighted least squares ends it. Where n is not known either it is fitted with τ. What the vectors then
+//! iteratively re-weighted least squares ends it. Where n is not known either it is fitted with τ. Where the frames' gradients
+//! are at hand, theirs is the last word (`sights`): a vector is made of many cells' words. What the vectors then
 //! show of the gyro's error is taken off, and its bias is learnt (`fusion`).
 
 mod bias;

@@ -10,8 +10,8 @@ pub(super) struct Said {
 }
 
 impl Said {
-    /// Of cells' sums after [`centre`](super::pyramid::centre), at the corrections that were found; not of cells whose frames were more
-    /// alike before (`before` is negative), for their sums are those of another place. `scale` is camera pixels per pixel.
+    /// Of cells' sums after [`centre`](super::pyramid::centre), at the corrections that were found; not of cells that were left where
+    /// they are because their frames were more alike there (`before` is negative), for their sums are those of another place. `scale` is camera pixels per pixel.
     pub(super) fn take(&mut self, cells: &Sums, found: &Found, before: &[f32], scale: [f32; 2]) {
         let [xx, xy, yy, x, y, _, _, count, _] = cells.all();
         let [right, down] = &found.change;
@@ -20,7 +20,7 @@ impl Said {
         for cell in 0..before.len() {
             // Asked this way round, a NaN says nothing. A cell whose frames differ by more than noise counts as it is: what weighs noise
             // by how large it came out would pass for knowing more.
-            let known = before[cell] >= 0.0 && count[cell] > 0.0;
+            let known = before[cell] >= 0.0 && count[cell] > 0.0 && found.variance[cell] > 0.0;
             let (u, v) = (right[cell], down[cell]);
             let pull = [x[cell] - (xx[cell] * u + xy[cell] * v), y[cell] - (xy[cell] * u + yy[cell] * v)];
             let said = [

@@ -140,3 +140,26 @@ fn the_runtime_is_looked_for_where_the_docs_say() {
         ]
     );
 }
+
+#[test]
+fn an_upsampler_that_is_none_is_refused_where_it_is_needed() {
+    let folder = models();
+    let path = folder.path().join("manifest.toml");
+    let mut manifest: toml::Table = fs::read_to_string(&path).unwrap().parse().unwrap();
+    let network = manifest["pwcnet_fcdn"].as_table_mut().unwrap();
+    let pyramid = network["pyramid"].clone();
+    network.insert("upsampler".into(), pyramid);
+    fs::write(&path, manifest.to_string()).unwrap();
+    let config = |resolution| Config { models: folder.path().into(), resolution, ..Config::default() };
+    let text = Matcher::open(&config(Resolution::Full)).map(drop).unwrap_err().to_string();
+    assert!(text.contains("pwcnet_fcdn_pyramid.onnx") && text.contains("3 inputs"), "{text}");
+    assert!(Matcher::open(&config(Resolution::Quarter)).is_ok());
+    // Its bytes are checked as the others' are.
+    let torn = models();
+    let file = torn.path().join("upsampler_fcdn.onnx");
+    let mut bytes = fs::read(&file).unwrap();
+    bytes[100_000] ^= 1;
+    fs::write(&file, bytes).unwrap();
+    let config = Config { models: torn.path().into(), resolution: Resolution::Full, ..Config::default() };
+    assert!(matches!(Matcher::open(&config), Err(Error::Hash { .. })));
+}
