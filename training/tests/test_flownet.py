@@ -205,7 +205,7 @@ def test_an_unknown_recipe_or_network_is_refused():
     assert Run(DESCRIPTION | {"recipe": "unprocess", "clean": True}).recipe == "paper"
     with pytest.raises(ValueError, match="expected the recipe paper, authors-2021 or unprocess, found authors"):
         Run(DESCRIPTION | {"recipe": "authors"})
-    with pytest.raises(ValueError, match="pwcnet, raftsmall, flownets or flownetc, found flownet2"):
+    with pytest.raises(ValueError, match="pwcnet, upsampler, raftsmall, flownets or flownetc, found flownet2"):
         Run(DESCRIPTION | {"network": "flownet2"})
 
 
