@@ -54,6 +54,15 @@ def conv(inputs: int, outputs: int, dilation: int = 1, size: int = 3) -> nn.Sequ
     )
 
 
+def begin(*modules: nn.Module) -> None:
+    """Weights to begin with, of their convolutions."""
+    for module in modules:
+        for part in module.modules():
+            if isinstance(part, nn.Conv2d):
+                nn.init.kaiming_normal_(part.weight, a=0.1)
+                nn.init.zeros_(part.bias)
+
+
 def through(layers: nn.Module, parts: list[torch.Tensor]) -> torch.Tensor:
     """Layers that read several tensors as one. One operator in the bf16 graph of export.py."""
     return layers(parts[0] if len(parts) == 1 else torch.cat(parts, 1))
@@ -288,11 +297,7 @@ class PwcNet(nn.Module):
         super().__init__()
         self.fast = fast
         self.pyramid, self.decoder = Pyramid(), Decoder(dense)
-        for module in (self.pyramid.quarter, self.pyramid.context, self.decoder):
-            for part in module.modules():
-                if isinstance(part, nn.Conv2d):
-                    nn.init.kaiming_normal_(part.weight, a=0.1)
-                    nn.init.zeros_(part.bias)
+        begin(self.pyramid.quarter, self.pyramid.context, self.decoder)
         decoder = self.decoder
         with torch.no_grad():  # The residuals begin small, so that the soft arg-max leads.
             for last in (decoder.shared.predict, decoder.fine.predict, decoder.context[-1], decoder.error[-1], decoder.fast_error[-1]):

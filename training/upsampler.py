@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from networks import PwcNet, conv
+from networks import PwcNet, begin, conv
 
 CELL = 4
 REACH = 2
@@ -53,10 +53,7 @@ class Upsampler(nn.Module):
         dilations = (1, 1, 2)
         self.body = nn.Sequential(*(conv(i, o, d) for i, o, d in zip(widths, WIDTHS, dilations)))
         self.weights = nn.Conv2d(WIDTHS[-1], SIDE**2 * CELL**2, 1)
-        for part in self.body.modules():
-            if isinstance(part, nn.Conv2d):
-                nn.init.kaiming_normal_(part.weight, a=0.1)
-                nn.init.zeros_(part.bias)
+        begin(self.body)
         with torch.no_grad():
             self.weights.weight.normal_(0, 0.01)
             self.weights.bias.copy_((bilinear() + LEAST).log().flatten())
@@ -65,8 +62,7 @@ class Upsampler(nn.Module):
         near = around(flow, 1)
         others = torch.cat([near[:, :4], near[:, 5:]], 1) - flow[:, None]
         seen = [FACTOR * F.pixel_unshuffle(image, CELL) + OFFSET, asinh(others.flatten(1, 2)), torch.log(expected)]
-        scores = self.weights(self.body(torch.cat(seen, 1))).float()
-        scores = scores.unflatten(1, (SIDE**2, CELL**2))
+        scores = self.weights(self.body(torch.cat(seen, 1))).float().unflatten(1, (SIDE**2, CELL**2))
         # A softmax in parts, which a runtime need not turn round for an axis that is not the last.
         weights = torch.exp(scores - scores.amax(1, keepdim=True))
 

@@ -146,14 +146,13 @@ impl Sight {
         if let Some(said) = &self.said {
             return said.information * self.tukey(spread);
         }
-        let cut = (CUT * spread).powi(2);
-        let part = self.weight * self.length().powi(2) / cut;
+        let part = self.part(spread);
         if part >= 1.0 {
-            return SMatrix::zeros();
+            return Matrix2::zeros();
         }
-        let residual = Vector2::from(self.residual);
+        let (residual, cut) = (Vector2::from(self.residual), (CUT * spread).powi(2));
         let bend = residual * residual.transpose() * (4.0 * (1.0 - part) * self.weight / cut);
-        (SMatrix::identity() * (1.0 - part).powi(2) - bend) * self.weight
+        (Matrix2::identity() * (1.0 - part).powi(2) - bend) * self.weight
     }
 }
 
@@ -256,7 +255,7 @@ impl Fit {
             }
             self.residuals(&agreed.motion);
         }
-        self.conclude(&agreed, lean_sd).map(|found| Found { by_gradients: true, ..found })
+        self.conclude(&agreed, lean_sd)
     }
 
     /// Iteratively re-weighted least squares from a guess, and the spread that it ends with.

@@ -124,8 +124,8 @@ impl Fit {
     ) -> Option<Found> {
         let agreed = self.sights.iter().filter(|sight| sight.offered && sight.agrees);
         let mut sums = Sums::<D>::over(agreed, motion, spread);
-        let heard = self.sights.iter().any(|sight| sight.said.is_some());
-        let likeness = unfitted(self.likeness(spread), sums.count, D) * if heard { HEARD } else { 1.0 };
+        let by_gradients = self.sights.iter().any(|sight| sight.said.is_some());
+        let likeness = unfitted(self.likeness(spread), sums.count, D) * if by_gradients { HEARD } else { 1.0 };
         let unit = self.unit(spread);
         sums.noise *= likeness;
         sums.noise_turn *= likeness;
@@ -151,7 +151,7 @@ impl Fit {
             by_shift: Matrix5x2::from_fn(|i, j| if i < D { by_shift[(i, j)] } else { 0.0 }),
             by_normal: Matrix3::from_fn(|i, j| if given { by_normal[(i, j)] } else { 0.0 }),
             leftover,
-            by_gradients: false,
+            by_gradients,
             samples: 0,
             inliers: 0,
             stretch: (sums.stretch / f64::max(sums.count, 1.0)).sqrt(),

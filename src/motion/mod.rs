@@ -24,6 +24,7 @@ mod odometer;
 mod plane;
 mod quality;
 mod sights;
+mod thinned;
 
 pub use config::{AttitudeUse, Config, GyroUse, Mount, REASONS};
 pub use drift::{Diagnosis, Drift};

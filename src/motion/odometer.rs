@@ -14,7 +14,7 @@ use super::{
     mounting::Mounting,
     obstacles::Sighting,
     plane::Plane,
-    sights::Rays,
+    thinned::Rays,
 };
 use crate::{
     clock::Stamp,
@@ -150,10 +150,7 @@ impl Odometer {
     /// Takes a calibration.
     pub fn info(&mut self, info: &CameraInfo) -> Result<(), Error> {
         let lens = Lens::read(info)?;
-        if self.lens != lens {
-            self.lens = lens;
-            (self.thinned, self.whole) = Default::default();
-        }
+        self.lens = lens;
         if self.mounting.as_mut().is_some_and(|mounting| mounting.camera(&info.header.frame_id)) {
             self.mount();
         }

@@ -8,8 +8,9 @@ use super::{
     fit::{CUT, MEDIAN_LENGTH, SPREAD_MIN},
     lens::Lens,
     linear,
+    thinned::{Rays, Thinned, weight},
 };
-use crate::flow::{Flow, Grid};
+use crate::flow::Flow;
 
 /// The most vectors that are looked at: neighbours are alike, and what is asked of the plane needs no more.
 const PAIRS_MAX: usize = 600;
@@ -37,9 +38,8 @@ struct Pair {
 pub(super) struct Plane {
     /// Columns of the thinned raster.
     columns: usize,
-    /// Rays of its cells, and the raster and lens that they belong to.
-    rays: Vec<Option<[f64; 2]>>,
-    rays_of: Option<(Grid, Lens)>,
+    /// Rays of its cells.
+    seen: Rays,
     pairs: Vec<Pair>,
     scratch: Vec<f64>,
     /// Residuals over their spread, cell by cell; NaN where none agrees.
@@ -62,36 +62,19 @@ pub(super) struct Found {
 impl Plane {
     /// Takes the vectors that may be used, evenly thinned.
     pub(super) fn look(&mut self, flow: &Flow<'_>, lens: &Lens, confidence_min: f64) {
-        let grid = flow.grid;
-        let mut step = 1;
-        while grid.width.div_ceil(step) * grid.height.div_ceil(step) > PAIRS_MAX {
-            step += 1;
-        }
-        let cells = || {
-            let rows = (step / 2..grid.height.max(step / 2 + 1)).step_by(step);
-            rows.flat_map(move |row| (step / 2..grid.width.max(step / 2 + 1)).step_by(step).map(move |col| (col, row)))
-        };
-        let middle = |i: usize, scale: f32| (i as f64 + 0.5) * f64::from(scale) - 0.5;
-        let pixel = |(column, row)| [middle(column, grid.scale[0]), middle(row, grid.scale[1])];
-        if !self.rays_of.as_ref().is_some_and(|(of, by)| *of == grid && by == lens) {
-            self.rays_of = Some((grid, lens.clone()));
-            self.rays.clear();
-            self.rays.extend(cells().map(|cell| lens.ray(pixel(cell))));
-            self.columns = (step / 2..grid.width.max(step / 2 + 1)).step_by(step).count();
-        }
+        let raster = Thinned::to(flow.grid, PAIRS_MAX);
+        self.seen.see(lens, raster);
+        self.columns = raster.columns();
         self.pairs.clear();
-        self.pairs.extend(cells().zip(&self.rays).enumerate().filter_map(|(cell, (place, ray))| {
-            let at = place.1 * grid.width + place.0;
-            let confidence = f64::from(*flow.confidence.get(at)?);
-            let [u, v] = *flow.vectors.get(2 * at..2 * at + 2)? else { return None };
-            if confidence < confidence_min || !u.is_finite() || !v.is_finite() {
+        self.pairs.extend(raster.cells().zip(&self.seen.rays).enumerate().filter_map(|(cell, (place, ray))| {
+            let ([u, v], confidence) = raster.seen(flow, place)?;
+            if confidence < confidence_min {
                 return None;
             }
-            let [x, y] = pixel(place);
-            let to = lens.ray([x + f64::from(u), y + f64::from(v)])?;
-            // A probability p of being right to within a pixel is a Gaussian of variance −1 / (2 ln(1 − p)) px².
-            let weight = -2.0 * (1.0 - confidence.min(0.999)).ln();
-            Some(Pair { from: (*ray)?, to, weight, cell, residual: [0.0; 2], off: 0.0 })
+            let [x, y] = raster.pixel(place);
+            let to = lens.ray([x + u, y + v])?;
+            let (from, weight) = (ray.as_ref()?.at, weight(confidence));
+            Some(Pair { from, to, weight, cell, residual: [0.0; 2], off: 0.0 })
         }));
     }
 
@@ -176,7 +159,7 @@ impl Plane {
     pub(super) fn known(&mut self, found: &Found, at: [f64; 2]) -> Option<Matrix2<f64>> {
         let (mut slope, mut count) = (SMatrix::<f64, UNKNOWNS, UNKNOWNS>::zeros(), 0.0);
         self.scaled.clear();
-        self.scaled.resize(self.rays.len(), [f64::NAN; 2]);
+        self.scaled.resize(self.seen.rays.len(), [f64::NAN; 2]);
         for pair in self.pairs.iter().filter(|pair| pair.weight > 0.0) {
             let rows = rows(&found.homography, pair.from);
             slope += rows.transpose() * (pair.tukey_slope(found.spread) * rows);

@@ -17,12 +17,12 @@ use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 
 pub use config::{Config, REASONS};
 
-use super::{Lack, Odometer, Scale, Velocity, quality::below};
-use crate::{
-    clock::Stamp,
-    exposure::Exposed,
-    flow::{Flow, Grid},
+use super::{
+    Lack, Odometer, Scale, Velocity,
+    quality::below,
+    thinned::{Ray, Rays, Thinned, weight},
 };
+use crate::{clock::Stamp, exposure::Exposed, flow::Flow};
 use cell::{Cell, Scene};
 use heading::{Memory, Search};
 use mover::Movers;
@@ -131,9 +131,7 @@ pub struct Lookout {
     config: Config,
     cells: Vec<Cell>,
     columns: usize,
-    rays: Vec<Option<[f64; 2]>>,
-    /// The raster, its thinning and the calibration that `rays` belong to.
-    rays_of: Option<(Grid, super::lens::Lens)>,
+    rays: Rays,
     texture: Texture,
     movers: Movers,
     sectors: Sectors,
@@ -174,8 +172,7 @@ impl Lookout {
             config: config.clone(),
             cells: Vec::new(),
             columns: 0,
-            rays: Vec::new(),
-            rays_of: None,
+            rays: Rays::default(),
             texture: Texture::default(),
             movers: Movers::default(),
             sectors: Sectors::new(),
@@ -273,50 +270,31 @@ impl Lookout {
         sighting: &Sighting,
     ) -> Result<(), Lack> {
         let lens = odometer.lens(camera_size)?;
-        let grid = flow.grid;
-        let mut step = 1;
-        while grid.width.div_ceil(step) * grid.height.div_ceil(step) > CELLS_MAX {
-            step += 1;
-        }
-        let places = || {
-            let columns = move || (step / 2..grid.width.max(step / 2 + 1)).step_by(step);
-            let rows = (step / 2..grid.height.max(step / 2 + 1)).step_by(step);
-            rows.flat_map(move |row| columns().map(move |column| (column, row)))
-        };
-        let middle = |i: usize, scale: f32| (i as f64 + 0.5) * f64::from(scale) - 0.5;
-        let pixel = |(column, row)| [middle(column, grid.scale[0]), middle(row, grid.scale[1])];
-        if !self.rays_of.as_ref().is_some_and(|(of, by)| *of == grid && by == lens) {
-            self.rays_of = Some((grid, lens.clone()));
-            self.rays.clear();
-            self.rays.extend(places().map(|place| lens.ray(pixel(place))));
-            self.columns = (step / 2..grid.width.max(step / 2 + 1)).step_by(step).count();
-        }
+        let raster = Thinned::to(flow.grid, CELLS_MAX);
+        self.rays.see(lens, raster);
+        self.columns = raster.columns();
         self.texture.look(older);
         let back = (sighting.mount.transpose() * sighting.turn.to_rotation_matrix().matrix()) * sighting.mount;
         let turned = |[x, y]: [f64; 2]| {
             let ray = back * Vector3::new(x, y, 1.0);
             (ray.z > 0.1).then(|| [ray.x / ray.z, ray.y / ray.z])
         };
-        let size = grid.scale.map(|scale| scale * step as f32);
+        let size = flow.grid.scale.map(|scale| scale * raster.step as f32);
         let (texture, limit) = (&self.texture, self.config.texture_sd_px_max);
         let least = odometer.config.confidence_min.max(1e-3);
-        let cell = |place: (usize, usize), ray: Option<[f64; 2]>| -> Option<Cell> {
-            let at = place.1 * grid.width + place.0;
-            let centre = pixel(place);
-            let shown = Cell { shown: true, older: ray?, newer: turned(ray?)?, ..Cell::default() };
-            let confidence = f64::from(*flow.confidence.get(at)?);
-            let [u, v] = *flow.vectors.get(2 * at..2 * at + 2)? else { return Some(shown) };
-            let ends = [centre[0] + f64::from(u), centre[1] + f64::from(v)];
-            let newer = lens.ray(ends).filter(|_| u.is_finite() && v.is_finite()).and_then(turned);
+        let cell = |place: (usize, usize), ray: &Option<Ray>| -> Option<Cell> {
+            let older = ray.as_ref()?.at;
+            let shown = Cell { shown: true, older, newer: turned(older)?, ..Cell::default() };
+            let Some(([u, v], confidence)) = raster.seen(flow, place) else { return Some(shown) };
+            let centre = raster.pixel(place);
+            let newer = lens.ray([centre[0] + u, centre[1] + v]).and_then(turned);
             let (Some(newer), true) = (newer, confidence >= least) else { return Some(shown) };
             let texture = texture.at(centre.map(|c| c as f32), size);
             let seen = texture::best_sd(texture) <= limit;
-            // A probability p of being right to within a pixel is a Gaussian of variance −1 / (2 ln(1 − p)) px².
-            let weight = -2.0 * (1.0 - confidence.min(0.999)).ln();
-            Some(Cell { seen, newer, weight, texture, ..shown })
+            Some(Cell { seen, newer, weight: weight(confidence), texture, ..shown })
         };
         self.cells.clear();
-        self.cells.extend(places().zip(&self.rays).map(|(place, ray)| cell(place, *ray).unwrap_or_default()));
+        self.cells.extend(raster.cells().zip(&self.rays.rays).map(|(place, ray)| cell(place, ray).unwrap_or_default()));
         Ok(())
     }
 
