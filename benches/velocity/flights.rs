@@ -163,12 +163,16 @@ impl Sensors {
         let mut three = |sd: f64| Vector3::from_fn(|_, _| sd * draws.draw());
         let (bias, tilt, late) = (three(config.gyro_bias_sd_rad_s), three(TILT), three(config.gyro_offset_sd_s).x);
         let tilt = UnitQuaternion::from_scaled_axis(Vector3::new(tilt.x, tilt.y, 0.0));
+        let mut draws_of_force = Normals::new(self.plan.number, 0xacce);
+        let push = Vector3::from_fn(|_, _| config.accelerometer_bias_sd_m_s2 * draws_of_force.draw());
         let mut samples: Vec<Sample> = vec![];
         for imu in &self.imus {
             let mut imu = imu.clone();
             imu.header.stamp = Stamp(Stamp::from(imu.header.stamp).ns() + (late * 1e9) as i64).into();
             let w = &mut imu.angular_velocity;
             (w.x, w.y, w.z) = (w.x + bias.x, w.y + bias.y, w.z + bias.z);
+            let a = &mut imu.linear_acceleration;
+            (a.x, a.y, a.z) = (a.x + push.x, a.y + push.y, a.z + push.z);
             let q = &mut imu.orientation;
             let turned = UnitQuaternion::from_quaternion(Quaternion::new(q.w, q.x, q.y, q.z)) * tilt;
             (q.w, q.x, q.y, q.z) = (turned.w, turned.i, turned.j, turned.k);

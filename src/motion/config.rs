@@ -58,6 +58,13 @@ pub struct Config {
     pub samples_max: usize,
     /// Whether what the frames' gradients say in every cell has the last word on the velocity, where `[flow] refine` has them.
     pub gradients: bool,
+    /// Whether accelerometer and attitude, where the gyro's messages have them, carry the velocity from step to step. `false` gives
+    /// every step's own word, as who has an accelerometer himself wants it.
+    pub inertia: bool,
+    /// Noise of an accelerometer sample, where its message states none.
+    pub accelerometer_sd_m_s2: f64,
+    /// Bias that the accelerometer may have.
+    pub accelerometer_bias_sd_m_s2: f64,
     /// The fewest vectors that must agree.
     pub inliers_min: u32,
     /// The least part of the vectors that must agree.
@@ -74,6 +81,8 @@ pub struct Config {
     pub flow_bend_sd_cells: f64,
     /// How far the ground may be from a plane: by what part of the distance it bends where a ray's slope is 1.
     pub ground_bend_sd: f64,
+    /// By what part of the distance things may stand above the ground that vectors are too noisy to tell from it.
+    pub ground_relief_sd: f64,
     /// Clocks of gyro and camera that are further apart than this are said to be so.
     pub clock_offset_s_max: f64,
     /// A flow that turns further or less far than the gyro by more than this part is said to do so.
@@ -150,6 +159,9 @@ impl Default for Config {
             confidence_min: 0.05,
             samples_max: 1200,
             gradients: true,
+            inertia: true,
+            accelerometer_sd_m_s2: 0.2,
+            accelerometer_bias_sd_m_s2: 0.05,
             inliers_min: 60,
             inlier_part_min: 0.25,
             seed_rad: 0.004,
@@ -158,6 +170,7 @@ impl Default for Config {
             flow_shared_sd_part: 0.001,
             flow_bend_sd_cells: 0.002,
             ground_bend_sd: 0.05,
+            ground_relief_sd: 0.02,
             clock_offset_s_max: 0.002,
             turn_scale_off_max: 0.1,
             seed: 1,
@@ -201,6 +214,16 @@ pub const REASONS: &[(&str, &str)] = &[
         "true: a vector is what many cells say, and counts like any other; cell by cell and by their texture the same frames say a fifth to a \
          third more exactly how the camera moved and turned (models/velocity.md)",
     ),
+    (
+        "inertia",
+        "true: steps together err by 14 to 35 % less than each (models/velocity.md); false where an EKF is told the velocity, \
+         which has the accelerometer's word already",
+    ),
+    (
+        "accelerometer_sd_m_s2",
+        "a MEMS accelerometer of 100 µg/√Hz has 0.02; the rest is what a soft mount leaves of the propellers",
+    ),
+    ("accelerometer_bias_sd_m_s2", "5 mg are left of a MEMS bias after a calibration on six sides"),
     ("inliers_min", "60 vectors give the three unknowns a margin of 40 equations each"),
     ("inlier_part_min", "where fewer than a quarter agree, another plane may be the larger one"),
     ("seed_rad", "one and a half pixels of the network's image at its usual field of view"),
@@ -219,6 +242,10 @@ pub const REASONS: &[(&str, &str)] = &[
     (
         "ground_bend_sd",
         "a bulge of 5 cm a metre beside the image's middle: lawns and roads bend less, heaps and ditches more",
+    ),
+    (
+        "ground_relief_sd",
+        "in the dark a box or a bush a few decimetres high passes for ground seen from ten metres (cargo bench --bench velocity, Exp-6)",
     ),
     ("clock_offset_s_max", "at 1 rad/s² it turns 2 mrad/s that nobody made; twice what gyro_offset_sd_s counts with"),
     (

@@ -1,7 +1,7 @@
 //! The robust fit of the displacement over distance, τ, to the flow vectors of one step; of the ground's normal too
 //! where nobody knows it.
 
-use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix5, Matrix5x2, Matrix5x3, SMatrix, SVector, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, Matrix5, Matrix5x3, SMatrix, SVector, Vector2, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -177,8 +177,8 @@ pub(super) struct Found {
     pub(super) covariance: Matrix5<f64>,
     /// Change of both with an error of the turn that was taken off.
     pub(super) by_turn: Matrix5x3<f64>,
-    /// Change of both with a shift that all vectors share.
-    pub(super) by_shift: Matrix5x2<f64>,
+    /// Change of both with a shift (2) that all vectors share, and with a stretch: (x, y) of the ray.
+    pub(super) by_shared: Matrix5x3<f64>,
     /// Change of `tau` with an error of the normal that was given.
     pub(super) by_normal: Matrix3<f64>,
     /// The turn that is left in the vectors, where they tell it apart from the motion.
@@ -187,6 +187,8 @@ pub(super) struct Found {
     pub(super) by_gradients: bool,
     pub(super) samples: u32,
     pub(super) inliers: u32,
+    /// Of a vector of weight 1, radians.
+    pub(super) spread: f64,
     /// Root mean square of the length of those that agree, as they were seen: what an error of the network's that grows
     /// with the displacement grows with.
     pub(super) stretch: f64,

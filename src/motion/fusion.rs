@@ -15,16 +15,25 @@ use super::{
     bias::Shown,
     fit::Found,
     gyro::Turn,
+    inertia::{LASTING, Step},
     odometer::{Ground, Span},
     quality,
 };
 
 /// (rad/s)² of a body rate that nothing observed.
 const UNOBSERVED: f64 = 1e6;
-/// Turn (3), its clock, two stamps, two tilts, two shifts, the distance; …
-const PASSING: usize = 11;
+/// Turn (3), its clock, two stamps, two tilts, two shifts, a stretch, what stands on the ground, the distance; …
+const PASSING: usize = 13;
 /// … and the gyro's bias.
 const ERRORS: usize = PASSING + 3;
+/// Those that are the same in the next step: the gyro's clock, two tilts, two shifts, the stretch, what stands on the ground, the gyro's bias; what bends vectors (3) is
+/// the rest of what lasts.
+const LAST: [usize; LASTING_ERRORS] = [3, 6, 7, 8, 9, 10, 11, 13, 14, 15];
+const LASTING_ERRORS: usize = LASTING - 3;
+/// What stands on the ground and scatters no more than vectors do moves all of them together by so much of their spread.
+const HIDDEN: f64 = 0.05;
+/// Of what differs over the image as a turn does, so much as a stretch does (`cargo bench --bench velocity`, hovers' vertical errors).
+const STRETCHED: f64 = 0.35;
 /// The turn that is left in the vectors is no error of the sensors where its square over its covariance is larger: one
 /// step of a thousand, by chance.
 const GATE: f64 = 16.3;
@@ -57,9 +66,19 @@ impl Errors {
         self.seen.set_column(self.count, &deviation.seen);
         self.count += 1;
     }
+
+    /// The columns of those that last.
+    fn lastingly<const D: usize>(&self, of: &SMatrix<f64, D, ERRORS>) -> SMatrix<f64, D, LASTING_ERRORS> {
+        SMatrix::from_fn(|row, column| of[(row, LAST[column])])
+    }
+
+    /// What lasts of the velocity's error, as far as the vectors have said nothing about it.
+    fn lasting(&self) -> SMatrix<f64, 6, LASTING> {
+        self.lastingly(&self.moved).fixed_resize(0.0)
+    }
 }
 
-/// What all vectors may err by together, radians: by one shift, and by what differs over the image as a turn does.
+/// What all vectors may err by together, radians: by one shift, and by what differs over the image as a turn or a stretch does.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Alike {
     pub(super) shared: f64,
@@ -97,12 +116,17 @@ impl Odometer {
             linear: camera - lever,
             arm,
         };
-        let errors = self.errors(turn, ground, found, span, &fitted, alike.shared);
-        let (shift, mut covariance) = self.learn(&errors, found, span, &fitted, alike.bent);
-        let linear = fitted.linear - shift;
+        let errors = self.errors(turn, ground, found, span, &fitted, alike);
+        let Learnt { shift, mut covariance, lasting } = self.learn(&errors, found, span, &fitted, alike.bent);
+        let mut linear = fitted.linear - shift;
         let angular = turn.mean - errors.expected.angular;
         if turn.swing_variance.is_none() {
             unobserved(&mut covariance);
+        }
+        if self.config.inertia && turn.swing_variance.is_some() && distance.is_ok() {
+            self.carry(&mut linear, &mut covariance, &lasting, span, *forward.to_rotation_matrix().matrix());
+        } else {
+            self.inertia.forget();
         }
         let scale = match &ground.distance {
             Ok(d) => Scale::Metric { distance: d.metres },
@@ -123,7 +147,7 @@ impl Odometer {
     }
 
     /// Everything that errs and is not the vectors' own noise.
-    fn errors(&self, turn: &Turn, ground: &Ground, found: &Found, span: Span, fit: &Fitted, shared: f64) -> Errors {
+    fn errors(&self, turn: &Turn, ground: &Ground, found: &Found, span: Span, fit: &Fitted, alike: Alike) -> Errors {
         let (config, interval_s) = (&self.config, span.seconds);
         let to_camera = self.mount.inverse();
         let mut errors = Errors::default();
@@ -147,18 +171,21 @@ impl Odometer {
                 ..by_turn
             });
         }
-        let (by_normal, by_shift) =
-            found.leftover.as_ref().map_or_else(Default::default, |left| (left.by_normal, left.by_shift));
+        let (by_normal, by_shared) =
+            found.leftover.as_ref().map_or_else(Default::default, |left| (left.by_normal, left.by_shared));
         for tangent in ground.tangents {
             let tilt = tangent * ground.tilt_sd;
             let moved = fit.by_motion.fixed_columns::<3>(0) * (found.by_normal * (to_camera * tilt));
             let linear = moved - fit.camera * ground.longer(&tilt);
             errors.add(Effect { linear, seen: by_normal * (to_camera * tilt), ..Effect::default() });
         }
-        for axis in 0..2 {
-            let linear = fit.by_motion * found.by_shift.column(axis) * shared;
-            errors.add(Effect { linear, seen: by_shift.column(axis) * shared, ..Effect::default() });
+        for (axis, sd) in [alike.shared, alike.shared, STRETCHED * alike.bent].into_iter().enumerate() {
+            let linear = fit.by_motion * found.by_shared.column(axis) * sd;
+            errors.add(Effect { linear, seen: by_shared.column(axis) * sd, ..Effect::default() });
         }
+        // What moves more than the ground by less than vectors scatter is not told from it.
+        let relief = self.config.ground_relief_sd.min(HIDDEN * found.spread / found.tau.norm().max(f64::MIN_POSITIVE));
+        errors.add(Effect { linear: fit.camera * relief, ..Effect::default() });
         let part = ground.distance.as_ref().map_or(0.0, |d| d.sd / d.metres);
         errors.add(Effect { linear: fit.camera * part, ..Effect::default() });
         if turn.swing_variance.is_some() {
@@ -174,29 +201,25 @@ impl Odometer {
     /// What the turn that is left in the vectors says about all errors: what the linear velocity is to be less by, and
     /// the covariance that is left. What it says about the bias is kept. Without a gyro it is left alone: a turn that
     /// nobody measured is too large for the linear terms.
-    fn learn(
-        &mut self,
-        errors: &Errors,
-        found: &Found,
-        span: Span,
-        fit: &Fitted,
-        bent: f64,
-    ) -> (Vector3<f64>, Matrix6<f64>) {
+    fn learn(&mut self, errors: &Errors, found: &Found, span: Span, fit: &Fitted, bent: f64) -> Learnt {
         let mut covariance = errors.moved * errors.moved.transpose();
         let mut noise = covariance.fixed_view_mut::<3, 3>(0, 0);
         noise += fit.by_motion * found.covariance * fit.by_motion.transpose();
         let mean = errors.expected.linear;
-        let Some(left) = found.leftover.as_ref().filter(|_| errors.count > PASSING) else { return (mean, covariance) };
+        let unlearnt = |covariance| Learnt { shift: mean, covariance, lasting: errors.lasting() };
+        let Some(left) = found.leftover.as_ref().filter(|_| errors.count > PASSING) else {
+            return unlearnt(covariance);
+        };
         // Ground that is no plane bends the vectors by what it bends times the motion; and what all vectors share need
         // not be the same all over the image.
         let bend = (self.config.ground_bend_sd * found.tau.norm()).powi(2) + bent * bent;
         let total = errors.seen * errors.seen.transpose() + left.covariance + Matrix3::identity() * bend;
-        let Some(inverse) = total.try_inverse() else { return (mean, covariance) };
+        let Some(inverse) = total.try_inverse() else { return unlearnt(covariance) };
         let surprise = left.angle - errors.expected.seen;
         let odds = surprise.dot(&(inverse * surprise));
         if odds.is_nan() || odds > GATE {
             self.bias.doubt();
-            return (mean, covariance);
+            return unlearnt(covariance);
         }
         let passing = errors.seen.fixed_columns::<PASSING>(0);
         let (mount, noise) = (self.mount.matrix(), passing * passing.transpose() + left.covariance);
@@ -213,8 +236,57 @@ impl Odometer {
         let mut known = gain * both.transpose();
         // The rates stay the gyro's, less the bias: a filter that has the gyro is not told the flow's word twice.
         known.fixed_view_mut::<3, 3>(3, 3).fill(0.0);
-        (mean + gain.fixed_rows::<3>(0) * surprise, covariance - known)
+        let gain = gain.fixed_rows::<3>(0);
+        let mut lasting = errors.lasting();
+        let mut columns = lasting.fixed_view_mut::<3, LASTING_ERRORS>(0, 0);
+        columns -= gain * errors.lastingly(&errors.seen);
+        lasting.fixed_view_mut::<3, 3>(0, LASTING_ERRORS).copy_from(&(gain * bend.sqrt()));
+        Learnt { shift: mean + gain * surprise, covariance: covariance - known, lasting }
     }
+
+    /// Weighs the step with what the steps before and the accelerometer say.
+    fn carry(
+        &mut self,
+        linear: &mut Vector3<f64>,
+        covariance: &mut Matrix6<f64>,
+        lasting: &SMatrix<f64, 6, LASTING>,
+        span: Span,
+        turned: Matrix3<f64>,
+    ) {
+        let before = self.inertia.before(span.older);
+        let push =
+            before.and_then(|before| self.rates.push([before, span.older, span.newer], self.config.gyro_gap_s_max));
+        let (moved, rates) = (lasting.fixed_rows::<3>(0).into_owned(), lasting.fixed_rows::<3>(3).into_owned());
+        let weighed = self.inertia.take(
+            &Step {
+                older: span.older,
+                newer: span.newer,
+                turned,
+                linear: *linear,
+                noise: covariance.fixed_view::<3, 3>(0, 0) - moved * moved.transpose(),
+                with_rates: covariance.fixed_view::<3, 3>(0, 3) - moved * rates.transpose(),
+                lasting: moved,
+                rates,
+            },
+            push.as_ref(),
+            self.config.accelerometer_bias_sd_m_s2,
+        );
+        let Some(weighed) = weighed else { return };
+        *linear = weighed.linear;
+        covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&weighed.covariance);
+        covariance.fixed_view_mut::<3, 3>(0, 3).copy_from(&weighed.with_rates);
+        covariance.fixed_view_mut::<3, 3>(3, 0).copy_from(&weighed.with_rates.transpose());
+    }
+}
+
+/// What a step comes to once its vectors' word on the turn is heard.
+struct Learnt {
+    /// What the linear velocity is to be less by.
+    shift: Vector3<f64>,
+    /// Of (linear, angular).
+    covariance: Matrix6<f64>,
+    /// The part of it that the next step errs by too, a column of unit variance each.
+    lasting: SMatrix<f64, 6, LASTING>,
 }
 
 /// The fit in the newer body's axes.

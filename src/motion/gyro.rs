@@ -4,7 +4,10 @@ use std::collections::VecDeque;
 
 use nalgebra::{UnitQuaternion, Vector3};
 
-use super::{Config, Error, Lack};
+use super::{
+    Config, Error, Lack,
+    inertia::{GRAVITY, Push},
+};
 use crate::{clock::Stamp, wire::Imu};
 
 /// Four seconds at 1 kHz; what is older is of no use.
@@ -12,6 +15,9 @@ const ROOM: usize = 4096;
 
 /// Going back by more than this is a clock that was set or a recording that was started again.
 pub(super) const ANEW_S: f64 = 1.0;
+
+/// What a flying body's accelerometer shows on the average of two steps, over gravity: less is one whose driver takes gravity off.
+const FORCE_PARTS: [f64; 2] = [0.5, 2.0];
 
 #[derive(Debug, Clone, Copy)]
 struct Rate {
@@ -22,6 +28,8 @@ struct Rate {
     variance: f64,
     /// The world's up in body axes, and how far it may be off in radians.
     up: Option<(Vector3<f64>, f64)>,
+    /// Specific force, m/s², body axes, and (m/s²)² a sample.
+    force: Option<(Vector3<f64>, f64)>,
 }
 
 /// IMU samples in the order of their stamps.
@@ -75,7 +83,8 @@ impl Rates {
         if self.ring.len() == ROOM {
             self.ring.pop_front();
         }
-        self.ring.push_back(Rate { stamp, omega: self.body * omega, variance, up: self.up(imu, config) });
+        let (up, force) = (self.up(imu, config), self.force(imu, config));
+        self.ring.push_back(Rate { stamp, omega: self.body * omega, variance, up, force });
         Ok(())
     }
 
@@ -94,6 +103,17 @@ impl Rates {
         let variance = covariance[0].max(covariance[4]);
         let sd = if variance.is_finite() && variance > 0.0 { variance.sqrt() } else { config.attitude_sd_rad };
         Some((self.body * world.inverse_transform_vector(&Vector3::z()), sd))
+    }
+
+    /// The specific force in body axes, where the sample has one. Drivers without leave zeros behind, which nothing but a fall shows,
+    /// NaN, or a covariance of −1.
+    fn force(&self, imu: &Imu, config: &Config) -> Option<(Vector3<f64>, f64)> {
+        let a = imu.linear_acceleration;
+        let force = Vector3::new(a.x, a.y, a.z);
+        let stated = imu.linear_acceleration_covariance[0];
+        let there = stated >= 0.0 && force.iter().all(|value| value.is_finite()) && force != Vector3::zeros();
+        let sd = if stated.is_finite() && stated > 0.0 { stated.sqrt() } else { config.accelerometer_sd_m_s2 };
+        there.then(|| (self.body * force, sd * sd))
     }
 
     /// Whether there was any sample.
@@ -166,6 +186,49 @@ impl Rates {
         // Interpolating between two samples takes a third off the variance, on the average.
         let swing_variance = Some(4.0 / 3.0 * variance_last);
         Ok(Turn { rotation, mean: angle / interval_s, first, last, variance, swing_variance })
+    }
+
+    /// By how much the mean velocity of the interval between the last two of three stamps differs from that between the first two
+    /// by accelerometer and attitude; `None` where they do not cover both, or where what is measured is not gravity and a little more.
+    pub(super) fn push(&self, [before, older, newer]: [Stamp; 3], gap_s: f64) -> Option<Push> {
+        let first = self.ring.partition_point(|rate| rate.stamp < before).saturating_sub(1);
+        let (mut to_begin, mut change, mut weight, mut noise) =
+            (UnitQuaternion::identity(), Vector3::zeros(), 0.0, 0.0);
+        let (mut force, mut samples, mut up_sd) = (0.0, 0.0, 0.0_f64);
+        let mut last: Option<&Rate> = None;
+        for rate in self.ring.range(first..) {
+            let since = rate.stamp.seconds_since(last.map_or(before, |last| last.stamp));
+            if since > gap_s {
+                return None;
+            }
+            if let Some(last) = last {
+                to_begin *= UnitQuaternion::from_scaled_axis((last.omega + rate.omega) * (0.5 * since));
+            }
+            last = Some(rate);
+            if rate.stamp <= before {
+                continue;
+            }
+            let part = match rate.stamp < older {
+                true => rate.stamp.seconds_since(before) / older.seconds_since(before),
+                false => newer.seconds_since(rate.stamp) / newer.seconds_since(older),
+            };
+            if part <= 0.0 {
+                break;
+            }
+            let ((up, sd), (measured, variance)) = rate.up.zip(rate.force)?;
+            let by = part * since;
+            change += to_begin * (measured - up * GRAVITY) * by;
+            (weight, noise) = (weight + by, noise + by * by * variance);
+            (force, samples, up_sd) = (force + measured.norm(), samples + 1.0, up_sd.max(sd));
+        }
+        let covered = newer.seconds_since(last?.stamp) <= gap_s;
+        let gravity = (FORCE_PARTS[0] * GRAVITY * samples..FORCE_PARTS[1] * GRAVITY * samples).contains(&force);
+        if !(covered && gravity && weight > 0.0) {
+            return None;
+        }
+        let seconds = 0.5 * newer.seconds_since(before);
+        let scale = seconds / weight;
+        Some(Push { change: to_begin.inverse() * change * scale, variance: noise * scale * scale, seconds, up_sd })
     }
 
     /// Seconds of the interval that lie between samples near enough to each other.

@@ -1,7 +1,7 @@
 //! How the fit's result changes with whatever is uncertain, to first order: residuals and how alike they are, the turn, a
-//! shift of all vectors, the normal.
+//! shift and a stretch of all vectors, the normal.
 
-use nalgebra::{Matrix3, Matrix3x2, Matrix5, Matrix5x2, Matrix5x3, SMatrix, SVector, Vector3};
+use nalgebra::{Matrix2x3, Matrix3, Matrix5, Matrix5x3, SMatrix, SVector, Vector3};
 
 use super::fit::{Fit, Found, Motion, Sight};
 
@@ -22,8 +22,8 @@ pub(super) struct Leftover {
     pub(super) covariance: Matrix3<f64>,
     /// Covariance of the motion (τ, lean) with it.
     pub(super) with_motion: Matrix5x3<f64>,
-    /// Its change with a shift that all vectors share.
-    pub(super) by_shift: Matrix3x2<f64>,
+    /// Its change with a shift (2) that all vectors share, and with a stretch.
+    pub(super) by_shared: Matrix3<f64>,
     /// Its change with an error of the normal that was given.
     pub(super) by_normal: Matrix3<f64>,
 }
@@ -39,11 +39,11 @@ struct Sums<const D: usize> {
     /// What each of these pulls the motion by, …
     by_turn: SMatrix<f64, D, 3>,
     by_normal: SMatrix<f64, D, 3>,
-    by_shift: SMatrix<f64, D, 2>,
+    by_shared: SMatrix<f64, D, 3>,
     /// … and the turn.
     turn_pull: Vector3<f64>,
     turn_by_normal: Matrix3<f64>,
-    turn_by_shift: Matrix3x2<f64>,
+    turn_by_shared: Matrix3<f64>,
     /// Sum of the squared lengths as they were seen.
     stretch: f64,
     count: f64,
@@ -59,10 +59,10 @@ impl<const D: usize> Sums<D> {
             noise_both: SMatrix::zeros(),
             by_turn: SMatrix::zeros(),
             by_normal: SMatrix::zeros(),
-            by_shift: SMatrix::zeros(),
+            by_shared: SMatrix::zeros(),
             turn_pull: Vector3::zeros(),
             turn_by_normal: Matrix3::zeros(),
-            turn_by_shift: Matrix3x2::zeros(),
+            turn_by_shared: Matrix3::zeros(),
             stretch: 0.0,
             count: 0.0,
         };
@@ -73,7 +73,9 @@ impl<const D: usize> Sums<D> {
             let weighted = sight.pull(spread);
             let pull: SVector<f64, D> = rows.transpose() * weighted;
             let pull_turn = turned.transpose() * weighted;
-            let slanted = sight.per_slope(&motion.tau) * Vector3::new(sight.older[0], sight.older[1], 1.0).transpose();
+            let [x, y] = sight.older;
+            let shared = Matrix2x3::new(1.0, 0.0, x, 0.0, 1.0, y);
+            let slanted = sight.per_slope(&motion.tau) * Vector3::new(x, y, 1.0).transpose();
             sums.slope += bent * rows;
             sums.slope_turn += bent_turn * turned;
             sums.noise += pull * pull.transpose();
@@ -81,10 +83,10 @@ impl<const D: usize> Sums<D> {
             sums.noise_both += pull * pull_turn.transpose();
             sums.by_turn += bent * turned;
             sums.by_normal += bent * slanted;
-            sums.by_shift += bent;
+            sums.by_shared += bent * shared;
             sums.turn_pull += pull_turn;
             sums.turn_by_normal += bent_turn * slanted;
-            sums.turn_by_shift += bent_turn;
+            sums.turn_by_shared += bent_turn * shared;
             sums.stretch += sight.stretch * sight.stretch;
             sums.count += 1.0;
         }
@@ -106,7 +108,7 @@ impl<const D: usize> Sums<D> {
             still: (still * (self.turn_pull + moved), self.slope_turn / variance),
             covariance: moving * noise * moving.transpose(),
             with_motion: Matrix5x3::from_fn(|i, j| if i < D { with_motion[(i, j)] } else { 0.0 }),
-            by_shift: moving * (self.turn_by_shift - by_turn.transpose() * self.by_shift),
+            by_shared: moving * (self.turn_by_shared - by_turn.transpose() * self.by_shared),
             by_normal: moving * (self.turn_by_normal - by_turn.transpose() * self.by_normal),
         })
     }
@@ -140,20 +142,21 @@ impl Fit {
         let inverse = invert(&sums.slope)?;
         let leftover = sums.leftover(&inverse, &motion.tau, likeness * unit);
         let found = inverse * sums.noise * inverse.transpose();
-        let (by_turn, by_shift, by_normal) =
-            (inverse * sums.by_turn, inverse * sums.by_shift, inverse * sums.by_normal);
+        let (by_turn, by_shared, by_normal) =
+            (inverse * sums.by_turn, inverse * sums.by_shared, inverse * sums.by_normal);
         let given = lean_sd.is_none();
         Some(Found {
             tau: motion.tau,
             lean: motion.lean,
             covariance: Matrix5::from_fn(|i, j| if i < D && j < D { found[(i, j)] } else { 0.0 }),
             by_turn: Matrix5x3::from_fn(|i, j| if i < D { by_turn[(i, j)] } else { 0.0 }),
-            by_shift: Matrix5x2::from_fn(|i, j| if i < D { by_shift[(i, j)] } else { 0.0 }),
+            by_shared: Matrix5x3::from_fn(|i, j| if i < D { by_shared[(i, j)] } else { 0.0 }),
             by_normal: Matrix3::from_fn(|i, j| if given { by_normal[(i, j)] } else { 0.0 }),
             leftover,
             by_gradients,
             samples: 0,
             inliers: 0,
+            spread,
             stretch: (sums.stretch / f64::max(sums.count, 1.0)).sqrt(),
         })
     }

@@ -6,7 +6,8 @@
 //! x₂ − x₁ = (n·m₁)(−τ_x + x₂ τ_z) and the same in y: exact, and linear in τ. A seeded RANSAC starts the fit, and
 //! iteratively re-weighted least squares ends it. Where n is not known either it is fitted with τ. Where the frames' gradients
 //! are at hand, theirs is the last word (`sights`): a vector is made of many cells' words. What the vectors then
-//! show of the gyro's error is taken off, and its bias is learnt (`fusion`).
+//! show of the gyro's error is taken off, and its bias is learnt (`fusion`). Last, accelerometer and attitude carry what the
+//! steps before said to this one, and the two are weighed (`inertia`).
 
 mod bias;
 mod config;
@@ -15,6 +16,7 @@ mod fit;
 mod fusion;
 mod ground;
 mod gyro;
+mod inertia;
 mod integrated;
 mod lens;
 mod linear;
@@ -37,9 +39,10 @@ use crate::clock::Stamp;
 
 /// Translational velocity of the body, FLU (x forward, y left, z up), at the newer frame's stamp.
 ///
-/// It is the mean over the interval between the middles of both exposures, in the body axes of the newer frame. A network
-/// errs alike in frames that are alike: errors of successive steps are not independent, and a filter that takes them as
-/// such trusts them too much.
+/// It is the mean over the interval between the middles of both exposures, in the body axes of the newer frame. Where the
+/// IMU's messages have acceleration and attitude it holds what the steps before said too, carried here by them
+/// ([`Config::inertia`]): who has an accelerometer himself wants it without. A network errs alike in frames that are alike:
+/// errors of successive steps are not independent either way, and a filter that takes them as such trusts them too much.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Velocity {
     /// Stamp of the older frame.

@@ -10,6 +10,7 @@ use super::{
     fusion::Alike,
     ground::Ranges,
     gyro::{Rates, Turn},
+    inertia::Inertia,
     lens::Lens,
     mounting::Mounting,
     obstacles::Sighting,
@@ -49,6 +50,7 @@ pub struct Odometer {
     pub(super) plane: Plane,
     watch: Watch,
     pub(super) bias: Bias,
+    pub(super) inertia: Inertia,
     /// From a frame's stamp to the middle of its exposure.
     half_exposure_ns: i64,
 }
@@ -119,6 +121,7 @@ impl Odometer {
             plane: Plane::default(),
             watch: Watch::default(),
             bias: Bias::default(),
+            inertia: Inertia::default(),
             half_exposure_ns: 0,
         })
     }
@@ -181,6 +184,7 @@ impl Odometer {
         if matches!(kept, Err(Error::Backwards { anew: true, .. })) {
             // It may be another gyro, or this one on another day.
             self.bias = Bias::default();
+            self.inertia.forget();
         }
         kept
     }

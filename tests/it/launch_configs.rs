@@ -70,6 +70,29 @@ fn the_readme_explains_every_file() {
     }
 }
 
+/// An EKF weighs ODOMETRY's velocity with the accelerometer, whose word is in it already unless the settings say otherwise.
+#[test]
+fn an_ekf_is_not_told_the_accelerometers_word_twice() {
+    let folder = tempfile::tempdir().unwrap();
+    let bag = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings/real_raw_pan.mcap");
+    let run = |inertia: &str| {
+        let path = folder.path().join("odometry.toml");
+        let settings = format!(
+            "[camera.source.mcap]\npath = {bag:?}\n[motion]\n{inertia}\n[publish.mavlink]\nwords = [\"odometry\"]\nhz = -1.0\n"
+        );
+        fs::write(&path, settings).unwrap();
+        let output =
+            Command::new(env!("CARGO_BIN_EXE_nightflow")).arg("run").arg("--config").arg(&path).output().unwrap();
+        assert!(!output.status.success());
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    };
+    let said = run("");
+    assert!(said.contains("set inertia = false in [motion]"), "{said}");
+    // With it the settings go on to the next thing that is wrong with these.
+    let said = run("inertia = false");
+    assert!(said.contains("hz is -1"), "{said}");
+}
+
 /// Where ROS 2 is not installed its launch file can't be run, but Python can read it, and what it names can be looked for.
 #[test]
 fn the_ros_2_launch_file_is_python_and_names_what_is_there() {

@@ -2,6 +2,7 @@
 
 mod bias;
 mod gradients;
+mod inertia;
 mod lens;
 mod watch;
 
