@@ -58,8 +58,8 @@ pub struct Config {
     pub samples_max: usize,
     /// Whether what the frames' gradients say in every cell has the last word on the velocity, where `[flow] refine` has them.
     pub gradients: bool,
-    /// Whether accelerometer and attitude, where the gyro's messages have them, carry the velocity from step to step. `false` gives
-    /// every step's own word, as who has an accelerometer himself wants it.
+    /// Whether accelerometer and attitude, where the gyro's messages have them (and `attitude` is `imu`), carry the velocity from
+    /// step to step. `false` gives every step's own word, as who has an accelerometer himself wants it.
     pub inertia: bool,
     /// Noise of an accelerometer sample, where its message states none.
     pub accelerometer_sd_m_s2: f64,

@@ -11,7 +11,7 @@
 use nalgebra::{Matrix3, Matrix3x5, Matrix6, Matrix6x3, SMatrix, Vector3};
 
 use super::{
-    Odometer, Scale, Velocity,
+    AttitudeUse, Odometer, Scale, Velocity,
     bias::Shown,
     fit::Found,
     gyro::Turn,
@@ -26,8 +26,8 @@ const UNOBSERVED: f64 = 1e6;
 const PASSING: usize = 13;
 /// … and the gyro's bias.
 const ERRORS: usize = PASSING + 3;
-/// Those that are the same in the next step: the gyro's clock, two tilts, two shifts, the stretch, what stands on the ground, the gyro's bias; what bends vectors (3) is
-/// the rest of what lasts.
+/// Those that are the same in the next step: the gyro's clock, two tilts, two shifts, the stretch, what stands on the ground, the
+/// gyro's bias; what bends vectors (3) is the rest of what lasts.
 const LAST: [usize; LASTING_ERRORS] = [3, 6, 7, 8, 9, 10, 11, 13, 14, 15];
 const LASTING_ERRORS: usize = LASTING - 3;
 /// What stands on the ground and scatters no more than vectors do moves all of them together by so much of their spread.
@@ -123,7 +123,8 @@ impl Odometer {
         if turn.swing_variance.is_none() {
             unobserved(&mut covariance);
         }
-        if self.config.inertia && turn.swing_variance.is_some() && distance.is_ok() {
+        let leads = self.config.inertia && self.config.attitude == AttitudeUse::Imu;
+        if leads && turn.swing_variance.is_some() && distance.is_ok() {
             self.carry(&mut linear, &mut covariance, &lasting, span, *forward.to_rotation_matrix().matrix());
         } else {
             self.inertia.forget();

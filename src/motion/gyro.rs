@@ -242,3 +242,63 @@ impl Rates {
         covered
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wire::{self, Header};
+
+    const STAMPS: [Stamp; 3] = [Stamp(1_000_000_000), Stamp(1_033_000_000), Stamp(1_067_000_000)];
+    const GAP_S: f64 = 0.02;
+
+    /// An IMU at rest but for what `force` adds to gravity (m/s², its own axes), tilted by `body` in a level body, at these times.
+    fn rates(
+        body: UnitQuaternion<f64>,
+        times_ms: impl Iterator<Item = i64>,
+        force: impl Fn(f64) -> Vector3<f64>,
+    ) -> Rates {
+        let config = Config::default();
+        let mut rates = Rates::new(body);
+        for ms in times_ms {
+            let felt = body.inverse() * (Vector3::z() * GRAVITY + force(ms as f64 * 1e-3));
+            let mut imu =
+                Imu { header: Header { stamp: Stamp(ms * 1_000_000).into(), ..Header::default() }, ..Imu::default() };
+            imu.linear_acceleration = wire::Vector3 { x: felt.x, y: felt.y, z: felt.z };
+            let q = body;
+            imu.orientation = wire::Quaternion { x: q.i, y: q.j, z: q.k, w: q.w };
+            imu.orientation_covariance[0] = 4e-6;
+            rates.keep(&imu, &config).unwrap();
+        }
+        rates
+    }
+
+    #[test]
+    fn a_push_is_the_acceleration_between_the_intervals_middles() {
+        for body in [UnitQuaternion::identity(), UnitQuaternion::from_euler_angles(0.4, -0.2, 2.0)] {
+            let steady = rates(body, (900..1100).step_by(4), |_| Vector3::new(1.0, -2.0, 0.5));
+            let push = steady.push(STAMPS, GAP_S).unwrap();
+            // From the middle of 33 ms to that of 34.
+            assert!((push.seconds - 0.0335).abs() < 1e-12);
+            assert!((push.change - Vector3::new(1.0, -2.0, 0.5) * 0.0335).norm() < 1e-9, "{}", push.change);
+            assert_eq!(push.up_sd, 0.002);
+            // One that grows: at the middle of both it is what it is on the average.
+            let growing = rates(body, (900..1100).step_by(4), |t| Vector3::x() * 10.0 * (t - 1.0));
+            let middle = (0.033 + 0.067 + 0.0) / 3.0;
+            let push = growing.push(STAMPS, GAP_S).unwrap();
+            assert!((push.change.x - 10.0 * middle * 0.0335).abs() < 2e-4, "{}", push.change);
+        }
+    }
+
+    #[test]
+    fn a_push_has_no_gap_and_covers_both_intervals() {
+        let level = UnitQuaternion::identity();
+        let of = |times: Vec<i64>| rates(level, times.into_iter(), |_| Vector3::zeros()).push(STAMPS, GAP_S);
+        assert!(of((900..1100).step_by(4).collect()).is_some());
+        // A lost sample is bridged, a lost sensor isn't: at the beginning, within, or at the end.
+        assert!(of((900..1100).step_by(4).filter(|ms| *ms != 1032).collect()).is_some());
+        assert!(of((1024..1100).step_by(4).collect()).is_none());
+        assert!(of((900..1100).step_by(4).filter(|ms| !(1010..1036).contains(ms)).collect()).is_none());
+        assert!(of((900..1044).step_by(4).collect()).is_none());
+        assert!(of(vec![]).is_none());
+    }
+}
