@@ -156,8 +156,8 @@ impl Flown {
 }
 
 impl Sensors {
-    /// The small samples and the frames' stamps as imperfect sensors give them: gyro bias, gyro clock, the rest of the
-    /// attitude's error and the stamps' jitter are drawn as large as the settings say that they are.
+    /// The small samples and the frames' stamps as imperfect sensors give them: gyro bias, gyro clock, accelerometer bias, the
+    /// rest of the attitude's error and the stamps' jitter are drawn as large as the settings say that they are.
     pub fn disturbed(&self, config: &Config) -> (Vec<Sample>, Vec<Stamp>) {
         let mut draws = Normals::new(self.plan.number, 0xd157);
         let mut three = |sd: f64| Vector3::from_fn(|_, _| sd * draws.draw());

@@ -1,7 +1,7 @@
 //! How good and how honest velocity is, from dusk to dark: `cargo bench --bench velocity -- --flights 256`.
 //!
 //! Flights over `darkness::flight`'s ground are photographed at the ladder's seven exposures and go through the node's
-//! own stages: exposure, a network, odometer. Gyro (noise and bias), range, stamps, attitude and the gyro's clock err as
+//! own stages: exposure, a network, odometer. Gyro and accelerometer (noise and bias), range, stamps, attitude and the gyro's clock err as
 //! much as the settings say. Flow may be kept in a folder (`--cache`), so that a change of the fit is judged in seconds.
 //! A network's name with `+refine` or `-refine` behind it is judged with and without the last step by the images' gradients.
 
@@ -34,6 +34,8 @@ use tables::Row;
 /// What is asked for.
 struct Asked {
     flights: u64,
+    /// The first flight's number.
+    first: u64,
     steps: usize,
     /// One flight of so many hovers.
     hovers: u64,
@@ -54,6 +56,7 @@ impl Asked {
         let bench = words.iter().any(|word| word == "--bench");
         let mut asked = Asked {
             flights: if bench { 40 } else { 1 },
+            first: 0,
             steps: if bench { 8 } else { 2 },
             hovers: 8,
             size: if bench { [640, 480] } else { [320, 256] },
@@ -70,6 +73,7 @@ impl Asked {
             let number = || value.parse().map_err(|error| format!("{word} {value}: {error}"));
             match word.as_str() {
                 "--flights" => asked.flights = number()?,
+                "--first" => asked.first = number()?,
                 "--steps" => asked.steps = number()? as usize,
                 "--hovers" => asked.hovers = number()?.max(1),
                 "--threads" => asked.threads = number()? as usize,
@@ -81,7 +85,7 @@ impl Asked {
                 "--csv" => asked.csv = Some(value.into()),
                 _ => {
                     return Err(format!(
-                        "{word} is not known: --flights --steps --hovers --threads --width --methods --cache --csv --plot --motion"
+                        "{word} is not known: --flights --first --steps --hovers --threads --width --methods --cache --csv --plot --motion"
                     ));
                 }
             }
@@ -99,7 +103,7 @@ fn work(asked: &Asked, camera: &Noise, next: &AtomicU64) -> Result<Vec<Vec<Row>>
     let mut rows = vec![vec![]; asked.methods.len()];
     loop {
         let number = next.fetch_add(1, Ordering::Relaxed);
-        if number >= asked.flights {
+        if number >= asked.first + asked.flights {
             return Ok(rows);
         }
         let mut taken = Taken::new(Plan::draw(number, asked.steps, asked.size, asked.hovers), asked.cache.as_deref())?;
@@ -113,7 +117,7 @@ fn work(asked: &Asked, camera: &Noise, next: &AtomicU64) -> Result<Vec<Vec<Row>>
 fn run() -> Result<(), String> {
     let asked = Asked::read()?;
     let camera = profiles::find("Canon EOS M6", 3200).map_err(|error| error.to_string())?;
-    let (next, start) = (AtomicU64::new(0), Instant::now());
+    let (next, start) = (AtomicU64::new(asked.first), Instant::now());
     let shares: Vec<Result<Vec<Vec<Row>>, String>> = std::thread::scope(|scope| {
         let threads: Vec<_> = (0..asked.threads.max(1)).map(|_| scope.spawn(|| work(&asked, &camera, &next))).collect();
         threads.into_iter().map(|thread| thread.join().unwrap_or(Err("a thread fell".into()))).collect()
