@@ -65,6 +65,16 @@ pub enum Error {
         /// What it names.
         word: &'static str,
     },
+    /// An EKF is to be told the accelerometer's word twice.
+    #[error(
+        "configuration {path}: publish.mavlink.words names odometry, whose velocity PX4's EKF weighs with the accelerometer itself, \
+         and with motion.inertia = true that has been done already: set inertia = false in [motion]",
+        path = path.display()
+    )]
+    ToldTwice {
+        /// The file.
+        path: PathBuf,
+    },
     /// The settings can't be written as TOML.
     #[error("the configuration can't be written: {0}")]
     Unwritable(#[from] toml::ser::Error),
@@ -84,10 +94,14 @@ impl Config {
             let hint = nearest(&reason).map(|name| format!("did you mean `{name}`?")).unwrap_or_default();
             Error::Invalid { path: path.into(), reason, hint }
         })?;
-        match config.unlooked() {
-            Some((key, word)) => Err(Error::NoLookout { path: path.into(), key, word }),
-            None => Ok(config),
+        if let Some((key, word)) = config.unlooked() {
+            return Err(Error::NoLookout { path: path.into(), key, word });
         }
+        let fused = config.publish.mavlink.as_ref().is_some_and(|mavlink| mavlink.words.contains(&Word::Odometry));
+        if fused && config.motion.inertia {
+            return Err(Error::ToldTwice { path: path.into() });
+        }
+        Ok(config)
     }
 
     /// What asks for obstacles though nobody looks for them: the setting, and what it names.

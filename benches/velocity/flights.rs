@@ -163,6 +163,7 @@ impl Sensors {
         let mut three = |sd: f64| Vector3::from_fn(|_, _| sd * draws.draw());
         let (bias, tilt, late) = (three(config.gyro_bias_sd_rad_s), three(TILT), three(config.gyro_offset_sd_s).x);
         let tilt = UnitQuaternion::from_scaled_axis(Vector3::new(tilt.x, tilt.y, 0.0));
+        // Of its own, so that what was drawn before there was an accelerometer stays what it was.
         let mut draws_of_force = Normals::new(self.plan.number, 0xacce);
         let push = Vector3::from_fn(|_, _| config.accelerometer_bias_sd_m_s2 * draws_of_force.draw());
         let mut samples: Vec<Sample> = vec![];

@@ -3,9 +3,7 @@
 use nalgebra::{UnitQuaternion, Vector3};
 
 use super::noise::Normals;
-
-/// m/s².
-const GRAVITY: f64 = 9.806_65;
+use crate::motion::GRAVITY;
 
 /// A sum of two sines with its derivatives.
 #[derive(Debug, Clone, Copy)]

@@ -16,6 +16,7 @@ use super::{
     fit::Found,
     gyro::Turn,
     inertia::{LASTING, Step},
+    linear::GATE,
     odometer::{Ground, Span},
     quality,
 };
@@ -34,9 +35,6 @@ const LASTING_ERRORS: usize = LASTING - 3;
 const HIDDEN: f64 = 0.05;
 /// Of what differs over the image as a turn does, so much as a stretch does (`cargo bench --bench velocity`, hovers' vertical errors).
 const STRETCHED: f64 = 0.35;
-/// The turn that is left in the vectors is no error of the sensors where its square over its covariance is larger: one
-/// step of a thousand, by chance.
-const GATE: f64 = 16.3;
 
 /// What an error does, …
 #[derive(Debug, Clone, Copy, Default)]
@@ -218,6 +216,7 @@ impl Odometer {
         let Some(inverse) = total.try_inverse() else { return unlearnt(covariance) };
         let surprise = left.angle - errors.expected.seen;
         let odds = surprise.dot(&(inverse * surprise));
+        // A turn that is left by more than that is no error of the sensors.
         if odds.is_nan() || odds > GATE {
             self.bias.doubt();
             return unlearnt(covariance);

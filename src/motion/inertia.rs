@@ -9,18 +9,15 @@
 
 use nalgebra::{Matrix3, Matrix6, Matrix6x3, SMatrix, Vector3};
 
-use super::linear::invert;
+use super::linear::{GATE, invert};
 use crate::clock::Stamp;
 
-/// m/s².
-pub(super) const GRAVITY: f64 = 9.806_65;
+/// Standard gravity, m/s².
+pub const GRAVITY: f64 = 9.806_65;
 /// What errs alike in every step.
 pub(super) const LASTING: usize = 13;
 /// m/s² after a second: an attitude's error moves, with the accelerations that a filter behind it takes for gravity.
 const WALK: f64 = 0.03;
-/// The carried velocity is none of the step's where the square of their difference over its covariance is larger: one step of a
-/// thousand, by chance.
-const GATE: f64 = 16.3;
 
 /// What accelerometer and attitude say between the steps, body axes at the newest stamp.
 #[derive(Debug, Clone, Copy)]

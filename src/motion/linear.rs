@@ -9,6 +9,10 @@ use super::fit::{Fit, Found, Motion, Sight};
 /// and of the same noise (`cargo bench --bench velocity`, Exp-6).
 const HEARD: f64 = 1.15;
 
+/// Three values that should agree contradict each other where the square of their difference over its covariance is larger: one time in
+/// a thousand, by chance.
+pub(super) const GATE: f64 = 16.3;
+
 /// The turn that is left in the vectors: by how much what the gyro said is more than what they show.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Leftover {

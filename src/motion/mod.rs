@@ -30,6 +30,7 @@ mod thinned;
 
 pub use config::{AttitudeUse, Config, GyroUse, Mount, REASONS};
 pub use drift::{Diagnosis, Drift};
+pub use inertia::GRAVITY;
 pub use integrated::{Integrated, NoFlow};
 pub use obstacles::{Lookout, NoSight, Obstacles, SECTORS, Sector};
 pub use odometer::Odometer;

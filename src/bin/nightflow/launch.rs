@@ -7,7 +7,7 @@ use std::{
     time::Duration,
 };
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use nightflow::{
     camera,
@@ -15,7 +15,7 @@ use nightflow::{
     flow::Matcher,
     node::{self, Governor, Outputs, Report},
     pipeline::Pipeline,
-    publish::{self, autopilot::Word, iceoryx2::SharedSink},
+    publish::{self, iceoryx2::SharedSink},
     recording::{self, Recorder},
 };
 use signal_hook::consts::{SIGINT, SIGTERM};
@@ -105,7 +105,7 @@ pub fn outputs(config: &Config, network: Option<&Matcher>) -> Result<Outputs<'st
     if let Some(recorder) = recorder(config, network)? {
         outputs.sinks.push(Box::new(recorder));
     }
-    network_sinks(config, &mut outputs)?;
+    network_sinks(&config.publish, &mut outputs)?;
     Ok(outputs)
 }
 
@@ -123,8 +123,7 @@ pub fn recorder(config: &Config, network: Option<&Matcher>) -> Result<Option<Rec
     Ok(Some(recorder))
 }
 
-fn network_sinks(config: &Config, outputs: &mut Outputs) -> Result<()> {
-    let (motion, config) = (&config.motion, &config.publish);
+fn network_sinks(config: &publish::Config, outputs: &mut Outputs) -> Result<()> {
     if let Some(ros2) = &config.ros2 {
         outputs.sinks.push(Box::new(publish::ros2::open(config, ros2)?));
     }
@@ -132,12 +131,6 @@ fn network_sinks(config: &Config, outputs: &mut Outputs) -> Result<()> {
         outputs.sinks.push(Box::new(publish::zenoh::open(config, zenoh)?));
     }
     if let Some(mavlink) = &config.mavlink {
-        if motion.inertia && mavlink.words.contains(&Word::Odometry) {
-            bail!(
-                "publish.mavlink.words names odometry, whose velocity PX4's EKF weighs with the accelerometer itself, \
-                 and with motion.inertia = true that has been done already: set inertia = false in [motion]"
-            );
-        }
         outputs.sinks.push(Box::new(publish::autopilot::mavlink::open(mavlink)?));
     }
     if let Some(px4) = &config.px4 {

@@ -1,9 +1,9 @@
 //! From step to step by the accelerometer: what it is told from, what it makes better, and what it must not be told from.
 
+use nightflow::motion::GRAVITY;
+
 use super::*;
 
-/// m/s².
-const GRAVITY: f64 = 9.806_65;
 const STEPS: i64 = 40;
 
 /// A flight that speeds up along a curve: (velocity, acceleration) in the world.
