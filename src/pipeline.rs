@@ -6,9 +6,9 @@ use crate::{
     camera::{Frame, Sample},
     clock::{Laps, Stage, Stamp},
     config::Config,
-    exposure::{self, Exposed, Linear, Linearizer, Pairing},
-    flow::{self, Lender, Matcher, Resolution, State},
-    motion::{self, Diagnosis, Lack, Lookout, NoSight, Odometer},
+    exposure::{self, Exposed, Linear, Linearizer, Pair, Pairing},
+    flow::{self, Grid, Keyframe, Lender, Matcher, Resolution, State},
+    motion::{self, Diagnosis, Keeping, Lack, Lookout, NoSight, Odometer, Velocity},
     publish::Moved,
 };
 
@@ -32,6 +32,8 @@ pub struct Front {
 pub struct Back {
     exposure: Pairing,
     flow: Matcher,
+    /// Where hovers are looked at over more than a step.
+    key: Option<Keyframe>,
     motion: Odometer,
     lookout: Option<Lookout>,
     gap_ms_max: f64,
@@ -102,9 +104,11 @@ impl Pipeline {
             Resolution::Quarter => 1.0,
             Resolution::Full | Resolution::Bilinear => 4.0,
         };
+        let keeps = config.flow.refine && config.flow.resolution == Resolution::Quarter;
         let back = Back {
             exposure: Pairing::new(&config.exposure)?,
             flow,
+            key: keeps.then(Keyframe::default),
             motion: Odometer::new(&motion)?.exposing(config.camera.exposure_s).standing_in(&config.publish.body_frame),
             lookout: motion.obstacles.as_ref().map(Lookout::new).transpose()?,
             gap_ms_max: config.flow.gap_ms_max,
@@ -226,6 +230,7 @@ impl Back {
             State::Blind(_) => Err(Lack::Blind),
             _ => self.motion.velocity_with(&flow, self.flow.gradients(), camera_size),
         };
+        look_back(&mut self.motion, self.key.as_mut(), &pair, velocity.as_ref().ok(), camera_size);
         let integrated = self.motion.integrated(&flow, camera_size, matches!(state, State::Blind(_)));
         let obstacles = match (&mut self.lookout, &state) {
             (None, _) => Err(NoSight::Off),
@@ -253,5 +258,27 @@ impl Back {
         };
         self.steps += 1;
         Ok(Outcome::Moved(moved))
+    }
+}
+
+/// Keeps a frame of a hover, and compares the newest with it, as the newest velocity asks for.
+fn look_back(
+    motion: &mut Odometer,
+    key: Option<&mut Keyframe>,
+    pair: &Pair<'_>,
+    velocity: Option<&Velocity>,
+    camera_size: [u32; 2],
+) {
+    let (Some(key), Some(velocity)) = (key, velocity) else { return motion.let_go() };
+    match motion.keep(velocity) {
+        Keeping::Keep => key.keep(pair.newer),
+        Keeping::Compare => {
+            let expect = &mut |grid: &Grid, vectors: &mut Vec<f32>| motion.expect(grid, camera_size, vectors);
+            match key.flow(pair.newer, expect) {
+                Some((flow, gradients)) => motion.look_back(&flow, &gradients, camera_size),
+                None => motion.let_go(),
+            }
+        }
+        Keeping::Wait => {}
     }
 }

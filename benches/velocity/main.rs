@@ -108,7 +108,8 @@ fn work(asked: &Asked, camera: &Noise, next: &AtomicU64) -> Result<Vec<Vec<Row>>
         }
         let mut taken = Taken::new(Plan::draw(number, asked.steps, asked.size, asked.hovers), asked.cache.as_deref())?;
         for ((name, rows), matcher) in asked.methods.iter().zip(&mut rows).zip(&mut matchers) {
-            let seen = taken.seen_by(name, matcher, camera)?;
+            let mut seen = taken.seen_by(name, matcher, camera)?;
+            taken.look_back(name, camera, &mut seen)?;
             rows.extend(tables::judge(&taken.sensors, &seen, &asked.motion)?);
         }
     }

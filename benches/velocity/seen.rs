@@ -15,13 +15,15 @@ use nightflow::{
         noise::Noise,
     },
     exposure::Developer,
-    flow::{Flow, Gradients, Grid, Matcher, Own, State},
+    flow::{Flow, Gradients, Grid, Keyframe, Matcher, Own, State},
+    motion::Keeping,
 };
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 use super::{
     flights::{Flown, Plan, Sensors, fly},
     opencv::{METHODS, OpenCv},
+    tables,
 };
 
 /// Stamps of one flight at one exposure lie this far from those of the next, so that no features are taken for others'.
@@ -42,6 +44,28 @@ pub struct Step {
     pub confidence: Vec<f32>,
     /// The five planes of [`Gradients`], one after the other; empty where there are none.
     pub gradients: Vec<f32>,
+    /// What a frame that was kept shows of it.
+    pub back: Option<Back>,
+}
+
+/// Flow from a frame that was kept to the newer frame of a step, on the step's raster.
+#[derive(Debug, Clone, Default)]
+pub struct Back {
+    /// The kept frame's number.
+    pub kept: usize,
+    /// Vectors, confidence and the planes of gradients.
+    pub planes: Vec<f32>,
+}
+
+impl Back {
+    /// As the odometer takes it.
+    pub fn read(&self, grid: Grid, older: Stamp, newer: Stamp) -> Option<(Flow<'_>, Gradients<'_>)> {
+        let (vectors, rest) = self.planes.split_at_checked(2 * grid.cells())?;
+        let mut planes = rest.chunks_exact(grid.cells());
+        let mut next = || planes.next();
+        let flow = Flow { older, newer, grid, vectors, confidence: next()? };
+        Some((flow, Gradients { information: [next()?, next()?, next()?], pull: [next()?, next()?] }))
+    }
 }
 
 impl Step {
@@ -72,6 +96,7 @@ impl Step {
             confidence: flow.vectors.as_chunks::<2>().0.iter().map(known).collect(),
             vectors: flow.vectors.clone(),
             gradients: vec![],
+            back: None,
         }
     }
 }
@@ -222,9 +247,76 @@ fn look(
             vectors: flow.vectors.to_vec(),
             confidence: flow.confidence.to_vec(),
             gradients,
+            back: None,
         });
     }
     Ok(steps)
+}
+
+/// Frames that were kept: (exposure, step, kept frame) of each comparison.
+type Backs = Vec<[usize; 3]>;
+
+impl Taken<'_> {
+    /// What frames that are kept show, as the node with default settings keeps them, beside what was seen between all frames.
+    pub fn look_back(&mut self, name: &str, camera: &Noise, seen: &mut Seen) -> Result<(), String> {
+        let path = self.cache.map(|folder| folder.join(format!("{name}_back_{:05}", self.sensors.plan.number)));
+        let size = 8 * seen[0].first().map_or(1, |step| step.grid.cells());
+        if let Some((kept, bytes)) = path.as_deref().and_then(read::<Backs>) {
+            let values: Vec<f32> = bytes.as_chunks::<4>().0.iter().map(|four| f32::from_le_bytes(*four)).collect();
+            for ([rung, step, kept], planes) in kept.into_iter().zip(values.chunks_exact(size)) {
+                seen[rung][step].back = Some(Back { kept, planes: planes.to_vec() });
+            }
+            return Ok(());
+        }
+        let config = settings(name);
+        let sensors = self.sensors.clone();
+        let flown = self.flown()?;
+        for (rung, steps) in seen.iter_mut().enumerate() {
+            let mut developer = Developer::new(&config.exposure).map_err(|error| error.to_string())?;
+            let (mut backs, mut key) = (vec![], Keyframe::default());
+            let mut develop = |index: usize, stamp: Stamp| {
+                let frame = flown.photograph(index, rung, camera, stamp);
+                developer.develop(&frame).map_err(|error| error.to_string())?;
+                developer.newest().cloned().ok_or_else(|| "no frame".to_owned())
+            };
+            develop(0, Stamp(0))?;
+            let mut kept = 0;
+            tables::follow(&sensors, steps, &config.motion, |at, odometer, keeping| {
+                let newer = develop(at.step + 1, at.newer)?;
+                match keeping {
+                    Keeping::Keep => {
+                        key.keep(&newer);
+                        kept = at.step + 1;
+                    }
+                    Keeping::Compare => {
+                        let expect = &mut |grid: &Grid, vectors: &mut Vec<f32>| odometer.expect(grid, at.size, vectors);
+                        if let Some((flow, said)) = key.flow(&newer, expect) {
+                            let planes =
+                                [flow.vectors, flow.confidence, &said.information.concat(), &said.pull.concat()]
+                                    .concat();
+                            odometer.look_back(&flow, &said, at.size);
+                            backs.push((at.step, Back { kept, planes }));
+                        }
+                    }
+                    Keeping::Wait => {}
+                }
+                Ok(())
+            })?;
+            for (step, back) in backs {
+                steps[step].back = Some(back);
+            }
+        }
+        if let Some(path) = path {
+            let all = |(rung, steps): (usize, &Vec<Step>)| -> Vec<([usize; 3], Vec<f32>)> {
+                let some =
+                    |(step, seen): (usize, &Step)| seen.back.clone().map(|back| ([rung, step, back.kept], back.planes));
+                steps.iter().enumerate().filter_map(some).collect()
+            };
+            let (kept, planes): (Backs, Vec<Vec<f32>>) = seen.iter().enumerate().flat_map(all).unzip();
+            write(&path, &kept, &planes.iter().flatten().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>())?;
+        }
+        Ok(())
+    }
 }
 
 fn pack(seen: &Seen) -> (Kept, Vec<u8>) {
@@ -255,6 +347,7 @@ fn unpack(kept: &Kept, bytes: &[u8]) -> Seen {
                 vectors: vectors.to_vec(),
                 confidence: confidence.to_vec(),
                 gradients: gradients.to_vec(),
+                back: None,
             }
         };
         kept.steps[rung].iter().map(step).collect()

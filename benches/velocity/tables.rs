@@ -5,8 +5,9 @@ use std::fmt::Write as _;
 use nalgebra::{Matrix6, Vector3, Vector6};
 use nightflow::{
     camera::Sample,
+    clock::Stamp,
     darkness::ladder::MEANS,
-    motion::{BOUND_M_S, BOUND_PART, BOUND_PER_S, Config, Drift, Odometer, Velocity},
+    motion::{BOUND_M_S, BOUND_PART, BOUND_PER_S, Config, Drift, Keeping, Odometer, Velocity},
 };
 
 use super::{
@@ -64,37 +65,77 @@ impl Row {
     }
 }
 
+/// Where [`follow`] is.
+pub struct At {
+    pub step: usize,
+    pub older: Stamp,
+    pub newer: Stamp,
+    /// Columns and rows of the camera.
+    pub size: [u32; 2],
+    pub velocity: Option<Velocity>,
+}
+
+/// Takes an odometer along what was seen of a flight; `then` is told what is to be done about the kept frame.
+pub fn follow(
+    sensors: &Sensors,
+    steps: &[Step],
+    config: &Config,
+    mut then: impl FnMut(&At, &mut Odometer, Keeping) -> Result<(), String>,
+) -> Result<(), String> {
+    let mut odometer = Odometer::new(config).map_err(|error| error.to_string())?;
+    odometer.info(&sensors.info).map_err(|error| error.to_string())?;
+    let (samples, stamps) = sensors.disturbed(config);
+    let mut samples = samples.iter().peekable();
+    for (index, step) in steps.iter().enumerate() {
+        let (older, newer) = (stamps[index], stamps[index + 1]);
+        while let Some(sample) = samples.next_if(|sample| sample.stamp() <= newer) {
+            let taken = match sample {
+                Sample::Imu(imu) => odometer.imu(imu),
+                Sample::Range(range) => odometer.range(range),
+                Sample::Info(_) | Sample::Frame(_) | Sample::Transforms(_) | Sample::Width(_) => Ok(()),
+            };
+            taken.map_err(|error| error.to_string())?;
+        }
+        let size = sensors.plan.size.map(|side| side as u32);
+        let velocity = odometer.velocity_with(&step.flow(older, newer), step.gradients(), size).ok();
+        let keeping = match &velocity {
+            Some(velocity) => odometer.keep(velocity),
+            None => {
+                odometer.let_go();
+                Keeping::Wait
+            }
+        };
+        then(&At { step: index, older, newer, size, velocity }, &mut odometer, keeping)?;
+    }
+    Ok(())
+}
+
 /// The velocities of one flight at all exposures.
 pub fn judge(sensors: &Sensors, seen: &Seen, config: &Config) -> Result<Vec<Row>, String> {
     let mut rows = vec![];
     for (rung, steps) in seen.iter().enumerate() {
-        let mut odometer = Odometer::new(config).map_err(|error| error.to_string())?;
-        odometer.info(&sensors.info).map_err(|error| error.to_string())?;
-        let (samples, stamps) = sensors.disturbed(config);
-        let mut samples = samples.iter().peekable();
-        for (before, step) in steps.iter().enumerate() {
-            let (older, newer) = (stamps[before], stamps[before + 1]);
-            while let Some(sample) = samples.next_if(|sample| sample.stamp() <= newer) {
-                let taken = match sample {
-                    Sample::Imu(imu) => odometer.imu(imu),
-                    Sample::Range(range) => odometer.range(range),
-                    Sample::Info(_) | Sample::Frame(_) | Sample::Transforms(_) | Sample::Width(_) => Ok(()),
-                };
-                taken.map_err(|error| error.to_string())?;
+        let mut frames = vec![];
+        follow(sensors, steps, config, |at, odometer, keeping| {
+            let (step, At { older, newer, .. }) = (&steps[at.step], at);
+            frames.push(*newer);
+            let back = step.back.as_ref().filter(|_| keeping == Keeping::Compare);
+            let kept = back.and_then(|back| Some((back, *frames.get(back.kept.checked_sub(1)?)?)));
+            if let Some((flow, gradients)) = kept.and_then(|(back, kept)| back.read(step.grid, kept, *newer)) {
+                odometer.look_back(&flow, &gradients, at.size);
             }
-            let size = sensors.plan.size.map(|side| side as u32);
-            let velocity = odometer.velocity_with(&step.flow(older, newer), step.gradients(), size).ok();
-            let integrated = odometer.integrated(&step.flow(older, newer), size, false);
-            let seconds = newer.seconds_since(older);
-            let [moved, turned] = sensors.below(before + 1, seconds);
+            let integrated = odometer.integrated(&step.flow(*older, *newer), at.size, false);
+            let seconds = newer.seconds_since(*older);
+            let [moved, turned] = sensors.below(at.step + 1, seconds);
             let length = |[x, y]: [f64; 2]| x.hypot(y) / seconds;
             let below = integrated.flow.ok().map(|angles| Below {
                 quality: integrated.quality,
                 error: length([0, 1].map(|i| angles[i] - moved[i] - turned[i])),
                 rate: length(moved),
             });
-            rows.push(Row { drift: odometer.drift(), below, ..row(sensors, rung, before + 1, step, velocity) });
-        }
+            let row = row(sensors, rung, at.step + 1, step, at.velocity);
+            rows.push(Row { drift: odometer.drift(), below, ..row });
+            Ok(())
+        })?;
     }
     Ok(rows)
 }

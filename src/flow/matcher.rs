@@ -309,7 +309,7 @@ fn finite(flow: &[f32], uncertainty: &[f32]) -> Result<(), Error> {
 /// Turns expected errors into confidence where they stand.
 ///
 /// An end-point error that is exponentially distributed with mean s is below one pixel with probability 1 − exp(−1/s).
-fn confide(uncertainty: &mut [f32]) {
+pub(super) fn confide(uncertainty: &mut [f32]) {
     for value in uncertainty {
         // The smallest that still has a finite reciprocal with room to spare; its confidence is 1.
         *value = 1.0 - (-1.0 / value.max(1e-6)).exp();
@@ -318,7 +318,7 @@ fn confide(uncertainty: &mut [f32]) {
 
 /// Takes the confidence from cells that stand on saturated pixels in either frame, and from those whose match has left
 /// the newer frame.
-fn mask(pair: &Pair<'_>, grid: &Grid, flow: &[f32], confidence: &mut [f32]) {
+pub(super) fn mask(pair: &Pair<'_>, grid: &Grid, flow: &[f32], confidence: &mut [f32]) {
     let (older, newer) = (pair.older, pair.newer);
     // Developed pixels per cell: 4 or 1; a frame of less than 4 pixels is one cell.
     let side = (grid.scale[0] / older.scale[0]).round() as usize;

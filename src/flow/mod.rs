@@ -8,6 +8,7 @@ pub mod cost_volume;
 mod error;
 mod fake;
 mod golden;
+mod keyframe;
 mod lanes;
 pub mod manifest;
 mod matcher;
@@ -38,6 +39,7 @@ pub use self::{
     error::Error,
     fake::{Fake, pattern},
     golden::Deviation,
+    keyframe::Keyframe,
     matcher::{Counts, Matcher},
     network::{Golden, Model, Network, Raster, Slot},
     onnx_graph::Graph,

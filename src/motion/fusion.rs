@@ -8,11 +8,11 @@
 //! of their errors together, for a tilted plane bends vectors too). What it says of the gyro's bias is kept for the
 //! steps to come.
 
-use nalgebra::{Matrix3, Matrix3x5, Matrix6, Matrix6x3, SMatrix, Vector3};
+use nalgebra::{Matrix3, Matrix3x2, Matrix3x5, Matrix6, Matrix6x3, SMatrix, Vector3};
 
 use super::{
     AttitudeUse, Odometer, Scale, Velocity,
-    bias::Shown,
+    bias::{ALIKE, Bias, Part, STATES, Shown},
     fit::Found,
     gyro::Turn,
     inertia::{LASTING, Step},
@@ -26,10 +26,10 @@ const UNOBSERVED: f64 = 1e6;
 /// Turn (3), its clock, two stamps, two tilts, two shifts, a stretch, what stands on the ground, the distance; …
 const PASSING: usize = 13;
 /// … and the gyro's bias.
-const ERRORS: usize = PASSING + 3;
+const ERRORS: usize = PASSING + STATES;
 /// Those that are the same in the next step: the gyro's clock, two tilts, two shifts, the stretch, what stands on the ground, the
 /// gyro's bias; what bends vectors (3) is the rest of what lasts.
-const LAST: [usize; LASTING_ERRORS] = [3, 6, 7, 8, 9, 10, 11, 13, 14, 15];
+const LAST: [usize; LASTING_ERRORS] = [3, 6, 7, 8, 9, 10, 11, 13, 14, 15, 16, 17, 18, 19, 20];
 const LASTING_ERRORS: usize = LASTING - 3;
 /// What stands on the ground and scatters no more than vectors do moves all of them together by so much of their spread.
 const HIDDEN: f64 = 0.05;
@@ -83,6 +83,13 @@ pub(super) struct Alike {
     pub(super) bent: f64,
 }
 
+impl Alike {
+    /// Of a shift right and down, and of a stretch.
+    pub(super) fn shared_sds(&self) -> [f64; 3] {
+        [self.shared, self.shared, STRETCHED * self.bent]
+    }
+}
+
 impl Odometer {
     /// From the fit's camera axes to the newer body axes, with everything that makes the velocity uncertain.
     pub(super) fn conclude(
@@ -113,9 +120,10 @@ impl Odometer {
             camera,
             linear: camera - lever,
             arm,
+            passed: ground.passed(&(self.mount * found.tau), turn),
         };
         let errors = self.errors(turn, ground, found, span, &fitted, alike);
-        let Learnt { shift, mut covariance, lasting } = self.learn(&errors, found, span, &fitted, alike.bent);
+        let Learnt { shift, mut covariance, lasting } = self.learn(&errors, ground, found, span, &fitted, alike.bent);
         let mut linear = fitted.linear - shift;
         let angular = turn.mean - errors.expected.angular;
         if turn.swing_variance.is_none() {
@@ -157,13 +165,10 @@ impl Odometer {
             angular: error / interval_s,
             seen: to_camera * error,
         };
-        for axis in 0..3 {
-            errors.add(turned(Vector3::ith(axis, turn.variance.sqrt())));
-        }
-        errors.add(turned((turn.last - turn.first) * config.gyro_offset_sd_s));
-        for (rate, sign) in [(turn.first, -1.0), (turn.last, 1.0)] {
-            let jitter = config.stamp_jitter_sd_s * sign;
-            let (by_turn, longer) = (turned(rate * jitter), jitter / interval_s);
+        let [gyro @ .., first, last] = self.turn_errors(turn);
+        gyro.into_iter().for_each(|error| errors.add(turned(error)));
+        for (error, sign) in [(first, -1.0), (last, 1.0)] {
+            let (by_turn, longer) = (turned(error), config.stamp_jitter_sd_s * sign / interval_s);
             errors.add(Effect {
                 linear: by_turn.linear - fit.linear * longer,
                 angular: by_turn.angular - turn.mean * longer,
@@ -178,7 +183,7 @@ impl Odometer {
             let linear = moved - fit.camera * ground.longer(&tilt);
             errors.add(Effect { linear, seen: by_normal * (to_camera * tilt), ..Effect::default() });
         }
-        for (axis, sd) in [alike.shared, alike.shared, STRETCHED * alike.bent].into_iter().enumerate() {
+        for (axis, sd) in alike.shared_sds().into_iter().enumerate() {
             let linear = fit.by_motion * found.by_shared.column(axis) * sd;
             errors.add(Effect { linear, seen: by_shared.column(axis) * sd, ..Effect::default() });
         }
@@ -188,19 +193,46 @@ impl Odometer {
         let part = ground.distance.as_ref().map_or(0.0, |d| d.sd / d.metres);
         errors.add(Effect { linear: fit.camera * part, ..Effect::default() });
         if turn.swing_variance.is_some() {
-            let believed = self.bias.believed(config.gyro_bias_sd_rad_s);
-            for deviation in believed.root.column_iter() {
-                errors.add(turned(deviation * interval_s));
-            }
-            errors.expected = turned(believed.mean * interval_s);
+            let believed = self.bias.believed();
+            let slopes = self.by_slope(ground, found);
+            let effect = |part: Part| {
+                let by_bias = turned(part.bias * interval_s);
+                Effect { seen: by_bias.seen + slopes * part.slope + to_camera * part.bent * alike.bent, ..by_bias }
+            };
+            believed.deviations().for_each(|deviation| errors.add(effect(deviation)));
+            errors.expected = effect(believed.mean());
         }
         errors
+    }
+
+    /// By what the gyro's turn may be off, in the older body axes, rad: its noise (3), its clock, and the stamps of both frames.
+    pub(super) fn turn_errors(&self, turn: &Turn) -> [Vector3<f64>; 6] {
+        let [x, y, z] = std::array::from_fn(|axis| Vector3::ith(axis, turn.variance.sqrt()));
+        let jitter = self.config.stamp_jitter_sd_s;
+        let late = (turn.last - turn.first) * self.config.gyro_offset_sd_s;
+        [x, y, z, late, turn.first * -jitter, turn.last * jitter]
+    }
+
+    /// How the turn that is left changes with the slope of the ground, a deviation of it in either direction: climbing over a slope
+    /// bends the vectors as a turn does. Ground that bulges by so much where a ray's slope is 1 slopes by as much.
+    pub(super) fn by_slope(&self, ground: &Ground, found: &Found) -> Matrix3x2<f64> {
+        let by_normal = found.leftover.as_ref().map_or_else(Matrix3::zeros, |left| left.by_normal);
+        let tangents = ground.tangents.map(|tangent| self.mount.inverse() * tangent * self.config.ground_bend_sd);
+        by_normal * Matrix3x2::from_columns(&tangents)
     }
 
     /// What the turn that is left in the vectors says about all errors: what the linear velocity is to be less by, and
     /// the covariance that is left. What it says about the bias is kept. Without a gyro it is left alone: a turn that
     /// nobody measured is too large for the linear terms.
-    fn learn(&mut self, errors: &Errors, found: &Found, span: Span, fit: &Fitted, bent: f64) -> Learnt {
+    fn learn(
+        &mut self,
+        errors: &Errors,
+        ground: &Ground,
+        found: &Found,
+        span: Span,
+        fit: &Fitted,
+        bent: f64,
+    ) -> Learnt {
         let mut covariance = errors.moved * errors.moved.transpose();
         let mut noise = covariance.fixed_view_mut::<3, 3>(0, 0);
         noise += fit.by_motion * found.covariance * fit.by_motion.transpose();
@@ -211,7 +243,8 @@ impl Odometer {
         };
         // Ground that is no plane bends the vectors by what it bends times the motion; and what all vectors share need
         // not be the same all over the image.
-        let bend = (self.config.ground_bend_sd * found.tau.norm()).powi(2) + bent * bent;
+        let moved = ground.along(&(self.mount * found.tau)).norm();
+        let bend = (self.config.ground_bend_sd * moved).powi(2);
         let total = errors.seen * errors.seen.transpose() + left.covariance + Matrix3::identity() * bend;
         let Some(inverse) = total.try_inverse() else { return unlearnt(covariance) };
         let surprise = left.angle - errors.expected.seen;
@@ -223,12 +256,18 @@ impl Odometer {
         }
         let passing = errors.seen.fixed_columns::<PASSING>(0);
         let (mount, noise) = (self.mount.matrix(), passing * passing.transpose() + left.covariance);
-        self.bias.take(&Shown {
-            angle: mount * left.angle,
-            interval_s: span.seconds,
-            noise: mount * noise * mount.transpose(),
-            lasting: bend,
-        });
+        self.bias.pass(span.seconds, fit.passed);
+        // A frame that is kept says it better, and of these very steps.
+        if !self.anchor.as_ref().is_some_and(|anchor| anchor.heard) {
+            let noise = noise * ALIKE + Matrix3::identity() * (bend * Bias::alike(span.seconds, fit.passed));
+            self.bias.take(&Shown {
+                angle: mount * left.angle,
+                interval_s: span.seconds,
+                noise: mount * noise * mount.transpose(),
+                by_slope: mount * self.by_slope(ground, found),
+                bent,
+            });
+        }
         let mut both: Matrix6x3<f64> = errors.moved * errors.seen.transpose();
         let mut with_noise = both.fixed_rows_mut::<3>(0);
         with_noise += fit.by_motion * left.with_motion;
@@ -298,9 +337,22 @@ struct Fitted {
     linear: Vector3<f64>,
     /// From the body to the camera, metres.
     arm: Vector3<f64>,
+    /// How far on the ground is: see [`Ground::passed`].
+    passed: f64,
 }
 
 impl Ground {
+    /// By how much it is other ground that is seen, or the same from another side: motion along it over the distance to it, body axes,
+    /// and the turn about its normal.
+    pub(super) fn passed(&self, tau: &Vector3<f64>, turn: &Turn) -> f64 {
+        self.along(tau).norm() + turn.rotation.scaled_axis().dot(&self.normal).abs()
+    }
+
+    /// What of a vector in body axes lies along the ground.
+    pub(super) fn along(&self, vector: &Vector3<f64>) -> Vector3<f64> {
+        vector - self.normal * self.normal.dot(vector)
+    }
+
     /// By what part the distance grows with a tilt of the normal: what is wrong about the one is wrong about the other.
     fn longer(&self, tilt: &Vector3<f64>) -> f64 {
         self.distance.as_ref().map_or(0.0, |d| tilt.dot(&d.hit) / d.metres)

@@ -15,7 +15,7 @@ use crate::clock::Stamp;
 /// Standard gravity, m/s².
 pub const GRAVITY: f64 = 9.806_65;
 /// What errs alike in every step.
-pub(super) const LASTING: usize = 13;
+pub(super) const LASTING: usize = 18;
 /// m/s² after a second: an attitude's error moves, with the accelerations that a filter behind it takes for gravity.
 const WALK: f64 = 0.03;
 
@@ -69,6 +69,8 @@ struct Kept {
     covariance: Matrix6<f64>,
     /// … and what lasts.
     lasting: SMatrix<f64, 6, LASTING>,
+    /// Whether the newest step contradicted it.
+    doubted: bool,
 }
 
 /// The velocity's memory.
@@ -88,11 +90,15 @@ impl Inertia {
         self.kept = None;
     }
 
-    /// Weighs a step with what is known from before; `None` where that is nothing, and the step stands alone. `push` is what leads
-    /// from there to here. An accelerometer is as wrong as `bias_sd` (m/s²) for good.
+    /// Weighs a step with what is known from before; `None` where that is nothing, or where the two contradict each other, and the step
+    /// stands alone. `push` is what leads from there to here. An accelerometer is as wrong as `bias_sd` (m/s²) for good.
+    ///
+    /// One contradiction says that one of the two is wrong, not which: what was known is kept beside. Two in a row end it.
     pub(super) fn take(&mut self, step: &Step, push: Option<&Push>, bias_sd: f64) -> Option<Weighed> {
-        let met = push.zip(self.kept).and_then(|(push, kept)| kept.carried(step, push, bias_sd).met(step));
-        self.kept = Some(met.map_or_else(|| Kept::anew(step), |(kept, _)| kept));
+        let carried = push.zip(self.kept).map(|(push, kept)| kept.carried(step, push, bias_sd));
+        let met = carried.and_then(|carried| carried.met(step));
+        let doubted = carried.filter(|carried| !carried.doubted).map(|carried| Kept { doubted: true, ..carried });
+        self.kept = met.map(|(kept, _)| kept).or(doubted).or_else(|| Some(Kept::anew(step)));
         let (kept, heard) = met?;
         let lasting = kept.lasting.fixed_rows::<3>(0);
         Some(Weighed {
@@ -110,7 +116,7 @@ impl Kept {
         covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&step.noise);
         lasting.fixed_rows_mut::<3>(0).copy_from(&step.lasting);
         let Step { older, newer, linear, .. } = *step;
-        Kept { older, newer, linear, leak: None, covariance, lasting }
+        Kept { older, newer, linear, leak: None, covariance, lasting, doubted: false }
     }
 
     /// To the end of a step that begins where this ends.
@@ -129,6 +135,8 @@ impl Kept {
             covariance[(axis + 3, axis + 3)] += WALK * WALK * push.seconds;
         }
         Kept {
+            older: step.older,
+            newer: step.newer,
             linear: step.turned * self.linear + push.change - leak * push.seconds,
             leak: Some(leak),
             covariance,
@@ -155,12 +163,12 @@ impl Kept {
         columns -= gain;
         let change = gain * surprise;
         let kept = Kept {
-            older: step.older,
-            newer: step.newer,
             linear: self.linear + change.fixed_rows::<3>(0),
             leak: self.leak.map(|leak| leak + change.fixed_rows::<3>(3)),
             covariance: left * self.covariance * left.transpose() + gain * step.noise * gain.transpose(),
             lasting: self.lasting + gain * apart,
+            doubted: false,
+            ..self
         };
         Some((kept, gain.fixed_rows::<3>(0).into_owned()))
     }
@@ -266,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn a_word_that_contradicts_begins_anew() {
+    fn one_contradiction_changes_nothing_and_two_begin_anew() {
         let mut inertia = Inertia::default();
         let still = Vector3::zeros();
         for number in 0..20 {
@@ -274,12 +282,17 @@ mod tests {
         }
         let struck = Vector3::new(1.0, 0.0, 0.0);
         assert!(inertia.take(&step(20, struck, 0.05, 0.0), Some(&push(still)), BIAS_SD).is_none());
-        let next = inertia.take(&step(21, struck, 0.05, 0.0), Some(&push(still)), BIAS_SD).unwrap();
+        let next = inertia.take(&step(21, still, 0.05, 0.0), Some(&push(still)), BIAS_SD).unwrap();
+        assert!(next.linear.norm() < 1e-12 && next.covariance[(0, 0)] < 0.4 * 0.05 * 0.05, "{next:?}");
+
+        assert!(inertia.take(&step(22, struck, 0.05, 0.0), Some(&push(still)), BIAS_SD).is_none());
+        assert!(inertia.take(&step(23, struck, 0.05, 0.0), Some(&push(still)), BIAS_SD).is_none());
+        let next = inertia.take(&step(24, struck, 0.05, 0.0), Some(&push(still)), BIAS_SD).unwrap();
         assert!((next.linear - struck).norm() < 1e-12 && next.covariance[(0, 0)] > 0.4 * 0.05 * 0.05, "{next:?}");
         // Nor does anything lead over a gap, or from what was forgotten.
-        assert_eq!(inertia.before(Stamp(23 * PERIOD_NS)), None);
+        assert_eq!(inertia.before(Stamp(26 * PERIOD_NS)), None);
         inertia.forget();
-        assert_eq!(inertia.before(Stamp(22 * PERIOD_NS)), None);
-        assert!(inertia.take(&step(22, still, 0.05, 0.0), Some(&push(still)), BIAS_SD).is_none());
+        assert_eq!(inertia.before(Stamp(25 * PERIOD_NS)), None);
+        assert!(inertia.take(&step(25, still, 0.05, 0.0), Some(&push(still)), BIAS_SD).is_none());
     }
 }

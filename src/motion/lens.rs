@@ -47,6 +47,15 @@ impl Lens {
         }))
     }
 
+    /// The pixel of the frame that a ray (x, y, 1) is seen at; `None` beyond the lens's field.
+    pub(super) fn pixel(&self, ray: [f64; 2]) -> Option<[f64; 2]> {
+        let distorted = self.model.distort(ray)?;
+        Some(std::array::from_fn(|i| {
+            let full = distorted[i] * self.focal[i] + self.centre[i];
+            (full - self.corner[i] + 0.5) / self.binning[i] - 0.5
+        }))
+    }
+
     /// Columns and rows of the frames that this lens belongs to; zero when the calibration does not say.
     pub(super) fn size(&self) -> [u32; 2] {
         self.size
@@ -76,6 +85,35 @@ impl Model {
             "rational_polynomial" => Ok(Model::Radial(std::array::from_fn(coefficient))),
             "equidistant" => Ok(Model::Equidistant(std::array::from_fn(coefficient))),
             other => Err(Error::Distortion { model: other.into() }),
+        }
+    }
+
+    fn distort(&self, [x, y]: [f64; 2]) -> Option<[f64; 2]> {
+        let r2 = x * x + y * y;
+        match self {
+            Model::Pinhole => Some([x, y]),
+            Model::Radial(k) => {
+                let above = 1.0 + ((k[4] * r2 + k[1]) * r2 + k[0]) * r2;
+                let below = 1.0 + ((k[7] * r2 + k[6]) * r2 + k[5]) * r2;
+                let radial = above / below;
+                // Asked this way round, a NaN is nowhere. Beyond where the model folds back, no pixel is this ray's.
+                let there = [
+                    x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x),
+                    y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y,
+                ];
+                let back = undistort_radial(k, there)?;
+                ((back[0] - x).abs() + (back[1] - y).abs() < 1e-6).then_some(there)
+            }
+            Model::Equidistant(k) => {
+                let length = r2.sqrt();
+                if length < 1e-12 {
+                    return Some([x, y]);
+                }
+                let angle = length.atan();
+                let a2 = angle * angle;
+                let bent = angle * (1.0 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3]))));
+                Some([x * bent / length, y * bent / length])
+            }
         }
     }
 

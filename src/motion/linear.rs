@@ -9,6 +9,9 @@ use super::fit::{Fit, Found, Motion, Sight};
 /// and of the same noise (`cargo bench --bench velocity`, Exp-6).
 const HEARD: f64 = 1.15;
 
+/// Correlation of what vectors and gradients of the same frames err by (`cargo bench --bench velocity`, Exp-6).
+const ALIKE: f64 = 0.5;
+
 /// Three values that should agree contradict each other where the square of their difference over its covariance is larger: one time in
 /// a thousand, by chance.
 pub(super) const GATE: f64 = 16.3;
@@ -115,6 +118,76 @@ impl<const D: usize> Sums<D> {
             by_shared: moving * (self.turn_by_shared - by_turn.transpose() * self.by_shared),
             by_normal: moving * (self.turn_by_normal - by_turn.transpose() * self.by_normal),
         })
+    }
+}
+
+/// Two words on the same.
+#[derive(Clone, Copy)]
+struct Mean {
+    /// How much the first counts.
+    part: f64,
+    /// How much more the second scatters.
+    wider: f64,
+}
+
+impl Mean {
+    fn of<const R: usize, const C: usize>(self, a: &SMatrix<f64, R, C>, b: &SMatrix<f64, R, C>) -> SMatrix<f64, R, C> {
+        a * self.part + b * (1.0 - self.part)
+    }
+
+    /// Of covariances.
+    fn noise<const R: usize, const C: usize>(
+        self,
+        a: &SMatrix<f64, R, C>,
+        b: &SMatrix<f64, R, C>,
+    ) -> SMatrix<f64, R, C> {
+        let (first, second) = (self.part, 1.0 - self.part);
+        let both = ALIKE * first * second;
+        a * (first * first + both * self.wider) + b * (second * second + both / self.wider)
+    }
+}
+
+impl Leftover {
+    fn beside(&self, other: &Leftover, mean: Mean) -> Leftover {
+        Leftover {
+            angle: mean.of(&self.angle, &other.angle),
+            covariance: mean.noise(&self.covariance, &other.covariance),
+            with_motion: mean.noise(&self.with_motion, &other.with_motion),
+            by_shared: mean.of(&self.by_shared, &other.by_shared),
+            by_normal: mean.of(&self.by_normal, &other.by_normal),
+            ..*self
+        }
+    }
+}
+
+impl Found {
+    /// What gradients found beside what the vectors of the same frames did, each by how little it scatters; what vectors err by together,
+    /// `shared` (rad), their scatter doesn't show. In good light gradients know nearly everything; in noise the network knows what a
+    /// cell's gradients don't.
+    pub(super) fn beside(&self, seen: &Found, shared: f64) -> Found {
+        let scatter = |found: &Found| found.covariance.fixed_view::<3, 3>(0, 0).trace();
+        let vectors = scatter(seen) + 2.0 * shared * shared;
+        let part = vectors / (scatter(self) + vectors);
+        let wider = (scatter(seen) / scatter(self)).sqrt();
+        // Where either scatters by nothing at all there is nothing to weigh.
+        if !part.is_finite() || !(1e-3..1e3).contains(&wider) {
+            return *self;
+        }
+        let mean = Mean { part, wider };
+        let lean = |i: usize| part * self.lean[i] + (1.0 - part) * seen.lean[i];
+        Found {
+            tau: mean.of(&self.tau, &seen.tau),
+            lean: [lean(0), lean(1)],
+            covariance: mean.noise(&self.covariance, &seen.covariance),
+            by_turn: mean.of(&self.by_turn, &seen.by_turn),
+            by_shared: mean.of(&self.by_shared, &seen.by_shared),
+            by_normal: mean.of(&self.by_normal, &seen.by_normal),
+            leftover: match (&self.leftover, &seen.leftover) {
+                (Some(a), Some(b)) => Some(a.beside(b, mean)),
+                (a, _) => *a,
+            },
+            ..*self
+        }
     }
 }
 

@@ -9,6 +9,7 @@
 //! show of the gyro's error is taken off, and its bias is learnt (`fusion`). Last, accelerometer and attitude carry what the
 //! steps before said to this one, and the two are weighed (`inertia`).
 
+mod anchor;
 mod bias;
 mod config;
 mod drift;
@@ -28,6 +29,7 @@ mod quality;
 mod sights;
 mod thinned;
 
+pub use anchor::Keeping;
 pub use config::{AttitudeUse, Config, GyroUse, Mount, REASONS};
 pub use drift::{Diagnosis, Drift};
 pub use inertia::GRAVITY;

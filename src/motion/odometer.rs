@@ -4,6 +4,7 @@ use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion, Vector3};
 
 use super::{
     AttitudeUse, Config, Diagnosis, Drift, Error, GyroUse, Lack, Mount, NoDistance, Velocity,
+    anchor::Anchor,
     bias::Bias,
     drift::{Turned, Watch},
     fit::{Fit, Found},
@@ -50,6 +51,7 @@ pub struct Odometer {
     pub(super) plane: Plane,
     watch: Watch,
     pub(super) bias: Bias,
+    pub(super) anchor: Option<Anchor>,
     pub(super) inertia: Inertia,
     /// From a frame's stamp to the middle of its exposure.
     half_exposure_ns: i64,
@@ -120,7 +122,8 @@ impl Odometer {
             every: Fit::default(),
             plane: Plane::default(),
             watch: Watch::default(),
-            bias: Bias::default(),
+            bias: Bias::new(config.gyro_bias_sd_rad_s),
+            anchor: None,
             inertia: Inertia::default(),
             half_exposure_ns: 0,
         })
@@ -153,6 +156,9 @@ impl Odometer {
     /// Takes a calibration.
     pub fn info(&mut self, info: &CameraInfo) -> Result<(), Error> {
         let lens = Lens::read(info)?;
+        if self.lens != lens {
+            self.let_go();
+        }
         self.lens = lens;
         if self.mounting.as_mut().is_some_and(|mounting| mounting.camera(&info.header.frame_id)) {
             self.mount();
@@ -173,7 +179,11 @@ impl Odometer {
         let found = self.mounting.as_ref().and_then(Mounting::find);
         self.mounted = found.is_some();
         if let Some(stands) = found {
-            self.mount = stands.rotation.to_rotation_matrix();
+            let mount = stands.rotation.to_rotation_matrix();
+            if mount != self.mount {
+                self.let_go();
+            }
+            self.mount = mount;
             self.config.camera_offset_m = stands.translation.vector.into();
         }
     }
@@ -183,8 +193,9 @@ impl Odometer {
         let kept = self.rates.keep(imu, &self.config);
         if matches!(kept, Err(Error::Backwards { anew: true, .. })) {
             // It may be another gyro, or this one on another day.
-            self.bias = Bias::default();
+            self.bias = Bias::new(self.config.gyro_bias_sd_rad_s);
             self.inertia.forget();
+            self.let_go();
         }
         kept
     }
@@ -218,19 +229,28 @@ impl Odometer {
         let seed = u64::from(self.config.seed) ^ flow.older.ns().cast_unsigned();
         let agreed = self.fit.solve(&self.config, ground.lean_sd, seed)?;
         let heard = gradients.filter(|_| self.config.gradients);
-        let found = heard.and_then(|gradients| self.hear(flow, &gradients, &agreed, &turn, &ground));
-        let found = found.or_else(|| self.fit.conclude(&agreed, ground.lean_sd)).ok_or(Lack::Degenerate)?;
+        let heard = heard.and_then(|gradients| self.hear(flow, &gradients, &agreed, &turn, &ground));
+        let found = match (heard, self.fit.conclude(&agreed, ground.lean_sd)) {
+            (Some(heard), Some(seen)) => heard.beside(&seen, self.alike(&seen, cell).shared),
+            (heard, seen) => heard.or(seen).ok_or(Lack::Degenerate)?,
+        };
         self.compare(&turn, &found, span);
-        let constant = self.config.flow_shared_sd_cells * cell;
-        let shared = (constant.powi(2) + (self.config.flow_shared_sd_part * found.stretch).powi(2)).sqrt();
-        let bent = if found.by_gradients { shared.hypot(self.config.flow_bend_sd_cells * cell) } else { shared };
+        let alike = self.alike(&found, cell);
         if ground.lean_sd.is_some() {
             let [a, b] = ground.tangents;
             ground.normal = (ground.normal + a * found.lean[0] + b * found.lean[1]).normalize();
             ground.distance = self.distance(span, &ground.normal);
         }
-        let velocity = self.conclude(&turn, &ground, &found, span, Alike { shared, bent });
+        let velocity = self.conclude(&turn, &ground, &found, span, alike);
         Ok(Velocity { older: flow.older, newer: flow.newer, ..velocity })
+    }
+
+    /// What all vectors may err by together, of a raster whose cells are so many radians wide.
+    pub(super) fn alike(&self, found: &Found, cell: f64) -> Alike {
+        let constant = self.config.flow_shared_sd_cells * cell;
+        let shared = (constant.powi(2) + (self.config.flow_shared_sd_part * found.stretch).powi(2)).sqrt();
+        let bent = if found.by_gradients { shared.hypot(self.config.flow_bend_sd_cells * cell) } else { shared };
+        Alike { shared, bent }
     }
 
     /// The lens of frames of this size (columns, rows), once it is known how it sits.
@@ -263,13 +283,18 @@ impl Odometer {
 
     /// From the middle of the older exposure to the middle of the newer one.
     pub(super) fn span(&self, flow: &Flow<'_>) -> Span {
+        self.between(flow.older, flow.newer)
+    }
+
+    /// The same for frames of these stamps.
+    pub(super) fn between(&self, older: Stamp, newer: Stamp) -> Span {
         let middle = |stamp: Stamp| Stamp(stamp.ns().saturating_add(self.half_exposure_ns));
-        let (older, newer) = (middle(flow.older), middle(flow.newer));
+        let (older, newer) = (middle(older), middle(newer));
         Span { older, newer, seconds: newer.seconds_since(older) }
     }
 
     /// How the body turned, or how it may have where that need not be known.
-    fn turn(&self, span: Span) -> Result<Turn, Lack> {
+    pub(super) fn turn(&self, span: Span) -> Result<Turn, Lack> {
         let measured = match self.rates.is_empty() {
             true => Err(Lack::Gyro),
             false => self.rates.turn(span.older, span.newer, &self.config),

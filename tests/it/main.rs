@@ -16,6 +16,7 @@ mod flow;
 mod flow_files;
 mod fused;
 mod iceoryx2;
+mod keyframes;
 mod latest;
 mod launch_configs;
 mod live;

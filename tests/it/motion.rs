@@ -3,6 +3,7 @@
 mod bias;
 mod gradients;
 mod inertia;
+mod keyframes;
 mod lens;
 mod watch;
 

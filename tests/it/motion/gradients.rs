@@ -127,9 +127,12 @@ fn the_covariance_is_that_of_the_cells_own_noise() {
     (config.gyro_sd_rad_s, config.gyro_bias_sd_rad_s, config.attitude_sd_rad) = (1e-6, 0.0, 1e-7);
     (config.range_sd_m, config.range_sd_part, config.climb_sd_m_s) = (1e-6, 0.0, 0.0);
     (config.flow_shared_sd_cells, config.flow_shared_sd_part, config.flow_bend_sd_cells) = (0.0, 0.0, 0.0);
-    config.ground_bend_sd = 0.0;
-    let exact = truth.exact();
+    (config.ground_bend_sd, config.ground_relief_sd) = (0.0, 0.0);
+    let mut seen = truth.exact();
     let (mut draws, mut sum) = (Normals::new(9, 0), 0.0);
+    // Vectors that scatter so much have no say.
+    let scatter: Vec<f32> = seen.vectors.iter().map(|_| (3.0 * draws.draw()) as f32).collect();
+    seen.vectors.iter_mut().zip(&scatter).for_each(|(vector, off)| *vector += off);
     const DRAWS: usize = 150;
     for _ in 0..DRAWS {
         let mut planes = vec![0.0; 5 * GRID.cells()];
@@ -139,12 +142,14 @@ fn the_covariance_is_that_of_the_cells_own_noise() {
             let turn = Matrix2::new(cosine, -sine, sine, cosine);
             let known = turn * Matrix2::new(strong, 0.0, 0.0, 0.1 * strong) * turn.transpose();
             let noise = turn * Vector2::new(strong.sqrt() * draws.draw(), (0.1 * strong).sqrt() * draws.draw());
-            let values = [known.m11, known.m12, known.m22, noise.x, noise.y];
+            let off = Vector2::new(scatter[2 * cell].into(), scatter[2 * cell + 1].into());
+            let pull = noise - known * off;
+            let values = [known.m11, known.m12, known.m22, pull.x, pull.y];
             for (plane, value) in values.into_iter().enumerate() {
                 planes[plane * GRID.cells() + cell] = value as f32;
             }
         }
-        let found = velocity(&truth, &exact, Some(&Said(planes))).unwrap();
+        let found = velocity(&truth, &seen, Some(&Said(planes))).unwrap();
         let error = Vector3::from(found.linear) - truth.expected();
         let covariance = Matrix3::from_fn(|i, j| found.covariance[i][j]);
         sum += (error.transpose() * covariance.try_inverse().unwrap() * error)[0] / 3.0;
