@@ -29,7 +29,6 @@ const MOVED_MAX: f64 = 0.2;
 const TURNED_MAX: f64 = 0.35;
 /// Ground that is no plane bends vectors by so many times what the gyro's bias may bend them, where the motion is too fast to say anything.
 const FAST: f64 = 2.0;
-
 /// Times that the turn is taken off which the time before has found.
 const ROUNDS: usize = 2;
 
@@ -167,7 +166,7 @@ impl Odometer {
         let focal = self.lens(camera_size).ok()?.focal();
         let span = self.span(flow);
         let turn = self.turn(span).ok().filter(|turn| turn.swing_variance.is_some())?;
-        let ground: Ground = self.ground(span);
+        let ground = self.ground(span);
         // The vectors' scatter is that of a turn that nobody took off unless it is: by what is believed, and then by what is found.
         let mut angle = self.bias.believed().mean().bias * span.seconds;
         let mut found = self.seen_from(flow, gradients, &turn, &ground, &angle)?;
@@ -205,9 +204,7 @@ impl Odometer {
         }
         likely.then_some(bias)
     }
-}
 
-impl Odometer {
     /// What both frames show once the gyro's turn, less `angle` (body axes of the kept frame), is taken off.
     fn seen_from(
         &mut self,

@@ -82,7 +82,8 @@ pub struct Config {
     pub flow_shared_sd_part: f64,
     /// By how much an error that cells share may differ over the image where gradients have the last word, in such cells.
     pub flow_bend_sd_cells: f64,
-    /// How far the ground may be from a plane: by what part of the distance it bends where a ray's slope is 1.
+    /// How far the ground may be from a level plane: by what part of the distance it bends where a ray's slope is 1, and how much it may
+    /// slope where the gyro's bias is learnt.
     pub ground_bend_sd: f64,
     /// By what part of the distance things may stand above the ground that vectors are too noisy to tell from it.
     pub ground_relief_sd: f64,
