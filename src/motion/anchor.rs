@@ -29,8 +29,8 @@ const MOVED_MAX: f64 = 0.2;
 const TURNED_MAX: f64 = 0.35;
 /// Ground that is no plane bends vectors by so many times what the gyro's bias may bend them, where the motion is too fast to say anything.
 const FAST: f64 = 2.0;
-/// Times that the turn is taken off which the time before has found.
-const ROUNDS: usize = 2;
+/// A turn that is left over, rad, and blows up the scatter: it is taken off, and what is left is looked at anew.
+const LEFT_MAX: f64 = 2e-4;
 
 /// What is to be done about the kept frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -170,8 +170,9 @@ impl Odometer {
         // The vectors' scatter is that of a turn that nobody took off unless it is: by what is believed, and then by what is found.
         let mut angle = self.bias.believed().mean().bias * span.seconds;
         let mut found = self.seen_from(flow, gradients, &turn, &ground, &angle)?;
-        for _ in 1..ROUNDS {
-            angle += self.mount * found.leftover.as_ref()?.angle;
+        let left = found.leftover.as_ref()?.angle;
+        if left.norm() > LEFT_MAX {
+            angle += self.mount * left;
             found = self.seen_from(flow, gradients, &turn, &ground, &angle)?;
         }
         let left = found.leftover.as_ref()?;
