@@ -184,3 +184,51 @@ fn undistort_equidistant(k: &[f64; 4], [xd, yd]: [f64; 2]) -> Option<[f64; 2]> {
     let stretch = angle.tan() / measured;
     Some([xd * stretch, yd * stretch])
 }
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn lens(model: &str, d: &[f64]) -> Lens {
+        let mut info = CameraInfo {
+            width: 1280,
+            height: 960,
+            distortion_model: model.into(),
+            d: d.to_vec(),
+            k: [700.0, 0.0, 650.0, 0.0, 690.0, 470.0, 0.0, 0.0, 1.0],
+            binning_x: 2,
+            binning_y: 2,
+            ..CameraInfo::default()
+        };
+        (info.roi.x_offset, info.roi.y_offset) = (16, 8);
+        Lens::read(&info).unwrap().unwrap()
+    }
+
+    proptest! {
+        #[test]
+        fn a_pixels_ray_is_seen_at_that_pixel(x in 0.0..600.0, y in 0.0..440.0) {
+            for (model, d) in [
+                ("plumb_bob", vec![0.0; 5]),
+                ("plumb_bob", vec![-0.28, 0.07, 1e-3, -5e-4, 0.0]),
+                ("rational_polynomial", vec![0.3, 0.02, 1e-4, 2e-4, 1e-3, 0.5, 0.04, 2e-3]),
+                ("equidistant", vec![0.01, -0.004, 0.002, -0.001]),
+            ] {
+                let lens = lens(model, &d);
+                let Some(ray) = lens.ray([x, y]) else { continue };
+                let pixel = lens.pixel(ray).unwrap();
+                prop_assert!((pixel[0] - x).abs() + (pixel[1] - y).abs() < 1e-6, "{model}: {pixel:?} of {x}, {y}");
+            }
+        }
+    }
+
+    #[test]
+    fn where_a_lens_folds_back_nothing_is_seen() {
+        let lens = lens("plumb_bob", &[-0.28, 0.0, 0.0, 0.0, 0.0]);
+        assert!(lens.pixel([0.5, 0.0]).is_some());
+        // x − 0.28 x³ is greatest at 1.09.
+        assert_eq!(lens.pixel([1.3, 0.0]), None);
+        assert_eq!(lens.pixel([f64::NAN, 0.0]), None);
+    }
+}
