@@ -296,6 +296,8 @@ impl Taken<'_> {
                                     .concat();
                             odometer.look_back(&flow, &said, at.size);
                             backs.push((at.step, Back { kept, planes }));
+                        } else {
+                            odometer.let_go();
                         }
                     }
                     Keeping::Wait => {}

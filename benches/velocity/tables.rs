@@ -120,8 +120,10 @@ pub fn judge(sensors: &Sensors, seen: &Seen, config: &Config) -> Result<Vec<Row>
             frames.push(*newer);
             let back = step.back.as_ref().filter(|_| keeping == Keeping::Compare);
             let kept = back.and_then(|back| Some((back, *frames.get(back.kept.checked_sub(1)?)?)));
-            if let Some((flow, gradients)) = kept.and_then(|(back, kept)| back.read(step.grid, kept, *newer)) {
-                odometer.look_back(&flow, &gradients, at.size);
+            match kept.and_then(|(back, kept)| back.read(step.grid, kept, *newer)) {
+                Some((flow, gradients)) => odometer.look_back(&flow, &gradients, at.size),
+                None if keeping == Keeping::Compare => odometer.let_go(),
+                None => {}
             }
             let integrated = odometer.integrated(&step.flow(*older, *newer), at.size, false);
             let seconds = newer.seconds_since(*older);

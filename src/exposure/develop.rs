@@ -149,7 +149,7 @@ impl Linear {
 
 impl Exposed {
     /// Whether two frames are of the same camera in the same mode.
-    fn like(&self, other: &Exposed) -> bool {
+    pub(crate) fn like(&self, other: &Exposed) -> bool {
         (self.width, self.height, self.scale) == (other.width, other.height, other.scale)
             && self.frame_id == other.frame_id
     }

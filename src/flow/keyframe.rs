@@ -5,8 +5,8 @@
 
 use super::{
     Flow, Gradients, Grid,
-    matcher::{confide, mask},
-    refine::{CELL, Refiner},
+    matcher::{confide, mask, quarter},
+    refine::Refiner,
 };
 use crate::exposure::{Exposed, Pair};
 
@@ -44,16 +44,12 @@ impl Keyframe {
         newer: &Exposed,
         expect: &mut dyn FnMut(&Grid, &mut Vec<f32>) -> Option<()>,
     ) -> Option<(Flow<'_>, Gradients<'_>)> {
-        self.kept &= like(&self.frame, newer);
+        self.kept &= comparable(&self.frame, newer);
         if !self.kept {
             return None;
         }
         self.light(newer);
-        let grid = Grid {
-            width: newer.width / CELL,
-            height: newer.height / CELL,
-            scale: newer.scale.map(|scale| scale * CELL as f32),
-        };
+        let grid = quarter(newer);
         expect(&grid, &mut self.vectors)?;
         if self.vectors.len() != 2 * grid.cells() {
             return None;
@@ -85,12 +81,10 @@ impl Keyframe {
 }
 
 /// Whether two frames can be compared.
-fn like(kept: &Exposed, newer: &Exposed) -> bool {
+fn comparable(kept: &Exposed, newer: &Exposed) -> bool {
     let light = newer.raw_mean / kept.raw_mean;
     let raw = !kept.linear.is_empty() && !newer.linear.is_empty();
-    (kept.width, kept.height, kept.scale) == (newer.width, newer.height, newer.scale)
-        && (1.0 / LIGHT_MAX..=LIGHT_MAX).contains(&light)
-        && (raw || kept.gain == newer.gain)
+    kept.like(newer) && (1.0 / LIGHT_MAX..=LIGHT_MAX).contains(&light) && (raw || kept.gain == newer.gain)
 }
 
 fn copy<T: Copy>(from: &[T], to: &mut Vec<T>) {

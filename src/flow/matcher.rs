@@ -140,11 +140,7 @@ impl Matcher {
         let (width, height) = (exposed.width, exposed.height);
         match self.config.resolution {
             Resolution::Full | Resolution::Bilinear => Grid { width, height, scale: [x, y] },
-            Resolution::Quarter => Grid {
-                width: (width / CELL).max(1),
-                height: (height / CELL).max(1),
-                scale: [x * CELL as f32, y * CELL as f32],
-            },
+            Resolution::Quarter => quarter(exposed),
         }
     }
 
@@ -266,6 +262,15 @@ impl Matcher {
         self.described[slot.index()] = Some(Key::of(exposed));
         self.counts.described += 1;
         Ok(())
+    }
+}
+
+/// The raster of a frame that has a cell for every whole 4 × 4 pixels.
+pub(super) fn quarter(exposed: &Exposed) -> Grid {
+    Grid {
+        width: (exposed.width / CELL).max(1),
+        height: (exposed.height / CELL).max(1),
+        scale: exposed.scale.map(|scale| scale * CELL as f32),
     }
 }
 

@@ -25,10 +25,10 @@ use super::{
 const UNOBSERVED: f64 = 1e6;
 /// Turn (3), its clock, two stamps, two tilts, two shifts, a stretch, what stands on the ground, the distance; …
 const PASSING: usize = 13;
-/// … and the gyro's bias.
+/// … and the gyro's bias with what passes for it.
 const ERRORS: usize = PASSING + STATES;
 /// Those that are the same in the next step: the gyro's clock, two tilts, two shifts, the stretch, what stands on the ground, the
-/// gyro's bias; what bends vectors (3) is the rest of what lasts.
+/// gyro's bias with what passes for it; ground that is no plane (3) is the rest of what lasts.
 const LAST: [usize; LASTING_ERRORS] = [3, 6, 7, 8, 9, 10, 11, 13, 14, 15, 16, 17, 18, 19, 20];
 const LASTING_ERRORS: usize = LASTING - 3;
 /// What stands on the ground and scatters no more than vectors do moves all of them together by so much of their spread.

@@ -10,7 +10,7 @@ use super::fit::{Fit, Found, Motion, Sight};
 const HEARD: f64 = 1.15;
 
 /// Correlation of what vectors and gradients of the same frames err by (`cargo bench --bench velocity`, Exp-6).
-const ALIKE: f64 = 0.5;
+const COMMON: f64 = 0.5;
 
 /// Three values that should agree contradict each other where the square of their difference over its covariance is larger: one time in
 /// a thousand, by chance.
@@ -142,7 +142,7 @@ impl Mean {
         b: &SMatrix<f64, R, C>,
     ) -> SMatrix<f64, R, C> {
         let (first, second) = (self.part, 1.0 - self.part);
-        let both = ALIKE * first * second;
+        let both = COMMON * first * second;
         a * (first * first + both * self.wider) + b * (second * second + both / self.wider)
     }
 }

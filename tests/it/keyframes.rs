@@ -65,15 +65,15 @@ fn fly(samples: &[Sample], keyframes: bool) -> Vec<(bool, Option<Velocity>)> {
     found
 }
 
-/// Root mean square over the steps of what is left of the bias across the optical axis, rad/s.
+/// What is left of the bias across the optical axis on the average of some steps, rad/s.
 fn left(steps: &[(bool, Option<Velocity>)], rates: &[Vector3<f64>], of: std::ops::Range<usize>) -> f64 {
-    let squares = of.clone().map(|step| {
+    let errors = of.clone().map(|step| {
         let truth = 0.5 * (rates[step] + rates[step + 1]);
         let found = Vector3::from(steps[step].1.as_ref().unwrap().angular);
         found - truth
     });
     // The gyro's own noise is new in every step.
-    (squares.sum::<Vector3<f64>>() / of.len() as f64).xy().norm()
+    (errors.sum::<Vector3<f64>>() / of.len() as f64).xy().norm()
 }
 
 #[test]

@@ -31,7 +31,7 @@ use pyramid::{Found, Level, Sums};
 use said::Said;
 
 /// Pixels of the developed image in a cell, along either side.
-pub(super) const CELL: usize = 4;
+const CELL: usize = 4;
 /// Images with a shorter side are left alone.
 const SIDE_MIN: usize = 16;
 const ROUNDS: usize = 2;
