@@ -16,8 +16,10 @@ const ROOM: usize = 4096;
 /// Going back by more than this is a clock that was set or a recording that was started again.
 pub(super) const ANEW_S: f64 = 1.0;
 
-/// What a flying body's accelerometer shows on the average of two steps, over gravity: less is one whose driver takes gravity off.
-const FORCE_PARTS: [f64; 2] = [0.5, 2.0];
+/// What a flying body's accelerometer shows on the average, over gravity: less is one whose driver takes gravity off.
+const GRAVITY_PARTS: [f64; 2] = [0.3, 2.0];
+/// Seconds over which that is averaged: a body that lets itself down feels little of it for a moment.
+const GRAVITY_S: f64 = 1.0;
 
 #[derive(Debug, Clone, Copy)]
 struct Rate {
@@ -37,6 +39,8 @@ struct Rate {
 pub(super) struct Rates {
     ring: VecDeque<Rate>,
     body: UnitQuaternion<f64>,
+    /// Of gravity, what the accelerometer showed of late.
+    felt: Option<f64>,
 }
 
 /// How the body turned between two stamps.
@@ -59,7 +63,7 @@ pub(super) struct Turn {
 impl Rates {
     /// An empty series; `body` brings IMU axes to body axes.
     pub(super) fn new(body: UnitQuaternion<f64>) -> Self {
-        Self { ring: VecDeque::with_capacity(ROOM), body }
+        Self { ring: VecDeque::with_capacity(ROOM), body, felt: None }
     }
 
     /// Takes a sample.
@@ -75,6 +79,7 @@ impl Rates {
             let anew = newest.seconds_since(stamp) > ANEW_S;
             if anew {
                 self.ring.clear();
+                self.felt = None;
             }
             return Err(Error::Backwards { sensor: "gyro", stamp, newest, anew });
         }
@@ -84,6 +89,11 @@ impl Rates {
             self.ring.pop_front();
         }
         let (up, force) = (self.up(imu, config), self.force(imu, config));
+        if let Some(((up, _), (force, _))) = up.zip(force) {
+            let now = force.dot(&up) / GRAVITY;
+            let since = self.ring.back().map_or(0.0, |newest| stamp.seconds_since(newest.stamp));
+            self.felt = Some(self.felt.map_or(now, |felt| felt + (now - felt) * (since / GRAVITY_S).min(1.0)));
+        }
         self.ring.push_back(Rate { stamp, omega: self.body * omega, variance, up, force });
         Ok(())
     }
@@ -194,8 +204,7 @@ impl Rates {
         let first = self.ring.partition_point(|rate| rate.stamp < before).saturating_sub(1);
         let (mut to_begin, mut change, mut weight, mut noise) =
             (UnitQuaternion::identity(), Vector3::zeros(), 0.0, 0.0);
-        let (mut force, mut samples, mut up_sd) = (0.0, 0.0, 0.0_f64);
-        let mut last: Option<&Rate> = None;
+        let (mut last, mut up_sd): (Option<&Rate>, f64) = (None, 0.0);
         for rate in self.ring.range(first..) {
             let since = rate.stamp.seconds_since(last.map_or(before, |last| last.stamp));
             if since > gap_s {
@@ -219,10 +228,10 @@ impl Rates {
             let by = part * since;
             change += to_begin * (measured - up * GRAVITY) * by;
             (weight, noise) = (weight + by, noise + by * by * variance);
-            (force, samples, up_sd) = (force + measured.norm(), samples + 1.0, up_sd.max(sd));
+            up_sd = up_sd.max(sd);
         }
         let covered = newer.seconds_since(last?.stamp) <= gap_s;
-        let gravity = (FORCE_PARTS[0] * GRAVITY * samples..FORCE_PARTS[1] * GRAVITY * samples).contains(&force);
+        let gravity = self.felt.is_some_and(|felt| (GRAVITY_PARTS[0]..GRAVITY_PARTS[1]).contains(&felt));
         if !(covered && gravity && weight > 0.0) {
             return None;
         }
@@ -287,6 +296,20 @@ mod tests {
             let push = growing.push(STAMPS, GAP_S).unwrap();
             assert!((push.change.x - 10.0 * middle * 0.0335).abs() < 2e-4, "{}", push.change);
         }
+    }
+
+    #[test]
+    fn a_body_that_lets_itself_down_has_an_accelerometer_all_the_same() {
+        let level = UnitQuaternion::identity();
+        let falls = Vector3::z() * (-0.8 * GRAVITY);
+        let of = |from: f64| rates(level, (0..1100).step_by(4), |t| if t < from { Vector3::zeros() } else { falls });
+        let push = of(0.9).push(STAMPS, GAP_S).unwrap();
+        assert!((push.change - falls * push.seconds).norm() < 1e-9, "{}", push.change);
+        // What feels none for good measures none.
+        let taken_off = rates(level, (0..1100).step_by(4), |_| Vector3::z() * -GRAVITY + Vector3::x());
+        assert!(taken_off.push(STAMPS, GAP_S).is_none());
+        let in_g = rates(level, (0..1100).step_by(4), |_| Vector3::z() * (1.0 - GRAVITY));
+        assert!(in_g.push(STAMPS, GAP_S).is_none());
     }
 
     #[test]

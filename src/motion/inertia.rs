@@ -16,6 +16,8 @@ use crate::clock::Stamp;
 pub const GRAVITY: f64 = 9.806_65;
 /// What errs alike in every step.
 pub(super) const LASTING: usize = 18;
+/// How many times what it says a step's own noise may be, where that explains it.
+const ROUGH: f64 = 2.0;
 /// m/s² after a second: an attitude's error moves, with the accelerations that a filter behind it takes for gravity.
 const WALK: f64 = 0.03;
 
@@ -93,10 +95,14 @@ impl Inertia {
     /// Weighs a step with what is known from before; `None` where that is nothing, or where the two contradict each other, and the step
     /// stands alone. `push` is what leads from there to here. An accelerometer is as wrong as `bias_sd` (m/s²) for good.
     ///
-    /// One contradiction says that one of the two is wrong, not which: what was known is kept beside. Two in a row end it.
+    /// Vectors scatter more than they say now and then, by noise that is not that of a bell: a step that twice its noise explains is
+    /// weighed with that. One contradiction beyond says that one of the two is wrong, not which: what was known is kept beside. Two in
+    /// a row end it.
     pub(super) fn take(&mut self, step: &Step, push: Option<&Push>, bias_sd: f64) -> Option<Weighed> {
         let carried = push.zip(self.kept).map(|(push, kept)| kept.carried(step, push, bias_sd));
-        let met = carried.and_then(|carried| carried.met(step));
+        let rough =
+            Step { noise: step.noise * (ROUGH * ROUGH), with_rates: step.with_rates * (ROUGH * ROUGH), ..*step };
+        let met = carried.and_then(|carried| carried.met(step).or_else(|| carried.met(&rough)));
         let doubted = carried.filter(|carried| !carried.doubted).map(|carried| Kept { doubted: true, ..carried });
         self.kept = met.map(|(kept, _)| kept).or(doubted).or_else(|| Some(Kept::anew(step)));
         let (kept, heard) = met?;
@@ -271,6 +277,24 @@ mod tests {
         // The newest step's own part counts for what it weighs by now; what lasts counts in full.
         assert!(late.with_rates[(0, 0)] < lasts[(0, 0)] + 0.4 * alone.with_rates[(0, 0)], "{}", late.with_rates);
         assert!(late.with_rates[(0, 0)] > 0.99 * lasts[(0, 0)], "{}", late.with_rates);
+    }
+
+    #[test]
+    fn a_step_that_scatters_more_than_it_says_counts_for_little() {
+        let still = Vector3::zeros();
+        let last = |struck: f64, noise: f64| {
+            let mut inertia = Inertia::default();
+            for number in 0..20 {
+                inertia.take(&step(number, still, 0.05, 0.0), Some(&push(still)), BIAS_SD);
+            }
+            inertia.take(&step(20, Vector3::new(struck, 0.0, 0.0), noise, 0.0), Some(&push(still)), BIAS_SD).unwrap()
+        };
+        let (rough, fair) = (last(0.35, 0.05), last(0.35, 0.1));
+        assert!((rough.linear - fair.linear).norm() < 1e-12, "{} {}", rough.linear, fair.linear);
+        assert!((rough.covariance - fair.covariance).norm() < 1e-12);
+        // Of its word, less than of one that is as rough as it says.
+        let (less, more) = (rough.linear.x / 0.35, last(0.1, 0.05).linear.x / 0.1);
+        assert!(less > 0.0 && less < 0.4 * more, "{less} {more}");
     }
 
     #[test]
