@@ -1,15 +1,18 @@
 //! The frame that is kept for a while: when, where it is expected to have gone, and what it then says of the gyro's bias.
 //!
 //! A turn that the gyro makes up grows with time, and so does the bend that it leaves in the vectors; what they are off by does not.
-//! Two frames of a hover that are a second apart show a bias thirty times as well as two that follow each other.
+//! Two frames of a hover that are a second apart show a bias thirty times as well as two that follow each other, and the mean velocity of
+//! that second too.
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 
 use super::{
     Odometer, Scale, Velocity,
-    bias::{Bias, Shown},
+    bias::{Believed, Bias, Shown},
     fit::Found,
+    fusion::Seen,
     gyro::Turn,
+    inertia::Step,
     lens::Lens,
     odometer::Ground,
     thinned::{Ray, Thinned},
@@ -96,6 +99,7 @@ impl Odometer {
                 return Keeping::Compare;
             }
         }
+        self.inertia.begin(self.between(velocity.older, velocity.newer).newer);
         self.anchor = Some(Anchor {
             kept: velocity.newer,
             metres,
@@ -148,9 +152,12 @@ impl Odometer {
         let said = self.anchor.clone().filter(|anchor| anchor.kept == flow.older && anchor.newest == flow.newer);
         let Some(anchor) = said else { return };
         match self.weigh(&anchor, flow, gradients, camera_size) {
-            Some(bias) => {
+            Some((bias, back)) => {
                 self.bias = bias;
                 self.anchor = Some(Anchor { heard: true, ..anchor });
+                if let Some(back) = back {
+                    self.inertia.look_back(&back, &bias.believed());
+                }
             }
             None => self.let_go(),
         }
@@ -162,7 +169,7 @@ impl Odometer {
         flow: &Flow<'_>,
         gradients: &Gradients<'_>,
         camera_size: [u32; 2],
-    ) -> Option<Bias> {
+    ) -> Option<(Bias, Option<Step>)> {
         let focal = self.lens(camera_size).ok()?.focal();
         let span = self.span(flow);
         let turn = self.turn(span).ok().filter(|turn| turn.swing_variance.is_some())?;
@@ -176,10 +183,11 @@ impl Odometer {
             found = self.seen_from(flow, gradients, &turn, &ground, &angle)?;
         }
         let left = found.leftover.as_ref()?;
+        let removed = angle;
         angle += self.mount * left.angle;
         let alike = self.alike(&found, f64::from(flow.grid.scale[0]) / focal);
-        let to_body = self.mount.matrix();
-        let bulge = self.config.ground_bend_sd * ground.along(&(self.mount * found.tau)).norm();
+        let seen = Seen { turn: &turn, ground: &ground, found: &found, span, alike };
+        let (to_body, bulge) = (self.mount.matrix(), self.bulge(&seen));
         let mut noise = Matrix3::identity() * (bulge * bulge) + to_body * left.covariance * to_body.transpose();
         for error in self.turn_errors(&turn) {
             noise += error * error.transpose();
@@ -193,6 +201,7 @@ impl Odometer {
         let to_middle = half * self.mount;
         let mut bias = anchor.before;
         bias.pass(span.seconds, ground.passed(&(self.mount * found.tau), &turn));
+        let before = bias.believed();
         let likely = bias.take(&Shown {
             angle: half * angle,
             interval_s: span.seconds,
@@ -203,7 +212,22 @@ impl Odometer {
         if !likely {
             self.bias.doubt();
         }
-        likely.then_some(bias)
+        likely.then(|| (bias, self.back(&before, &seen, &removed)))
+    }
+
+    /// How far the body has moved since the frame was kept, as one step, where that is known in metres. `before` is believed of the bias
+    /// but for these two frames; `removed` was taken off the turn before they were looked at.
+    fn back(&self, before: &Believed, seen: &Seen<'_>, removed: &Vector3<f64>) -> Option<Step> {
+        if !self.leads() || seen.ground.distance.is_err() {
+            return None;
+        }
+        let Seen { turn, found, span, .. } = *seen;
+        let (left, to_camera) = (found.leftover.as_ref()?, self.mount.inverse());
+        let mut fit = self.fitted(seen);
+        fit.linear += fit.by_turn(found, to_camera.matrix(), span.seconds) * removed;
+        let angle = to_camera * removed + left.angle;
+        let heard = self.errors(before, seen, &fit).heard(found, left, &fit, self.bulge(seen), &angle)?;
+        Some(Step::new(&heard, before, turn, span))
     }
 
     /// What both frames show once the gyro's turn, less `angle` (body axes of the kept frame), is taken off.

@@ -56,9 +56,19 @@ impl Believed {
         self.part(|i| self.mean[i])
     }
 
-    /// Deviations that are independent of each other.
-    pub(super) fn deviations(&self) -> impl Iterator<Item = Part> + '_ {
-        (0..STATES).map(|column| self.part(|i| self.root[(i, column)]))
+    /// One deviation beforehand of each.
+    pub(super) fn units(&self) -> impl Iterator<Item = Part> + '_ {
+        (0..STATES).map(|state| self.part(|i| f64::from(u8::from(i == state))))
+    }
+
+    /// What is believed of each, over its deviation beforehand.
+    pub(super) fn states(&self) -> &SVector<f64, STATES> {
+        &self.mean
+    }
+
+    /// The covariance of that is this times its transpose.
+    pub(super) fn root(&self) -> &SMatrix<f64, STATES, STATES> {
+        &self.root
     }
 }
 
@@ -170,8 +180,7 @@ mod tests {
     /// The bias that is believed in, and its deviation about the first axis.
     fn of(bias: &Bias) -> (Vector3<f64>, f64) {
         let believed = bias.believed();
-        let square: f64 = believed.deviations().map(|part| part.bias.x * part.bias.x).sum();
-        (believed.mean().bias, square.sqrt())
+        (believed.mean().bias, believed.root().row(0).norm() * bias.sd)
     }
 
     #[test]

@@ -5,21 +5,38 @@
 //! what is wrong about both, the leak, is fitted beside the velocity. What one step errs by and the next one too (the gyro's bias and
 //! clock, the tilt, what all vectors share) is never averaged out: it is carried along as columns of unit variance whose causes are
 //! the same in every step, and a step is weighed by what it does *not* have in common with those before (Schmidt's consider filter:
-//! S. F. Schmidt, "Application of state-space methods to navigation problems", 1966).
+//! S. F. Schmidt, "Application of state-space methods to navigation problems", 1966). What is believed of the gyro's bias by now is
+//! taken off in the end, from everything that was kept.
+//!
+//! Vectors scatter anew in every step, and their sum over a hover wanders. How far the body has moved since a frame that was kept
+//! ([`Back`]) ends that: by how much the steps' scatter added up is fitted too, and what it turns out to be was in part the newest's.
 
-use nalgebra::{Matrix3, Matrix6, Matrix6x3, SMatrix, Vector3};
+use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 
-use super::linear::{GATE, invert};
+use super::{
+    bias::Believed,
+    errors::{Heard, Lasting},
+    gyro::Turn,
+    linear::{GATE, invert},
+    odometer::Span,
+};
 use crate::clock::Stamp;
 
 /// Standard gravity, m/s².
 pub const GRAVITY: f64 = 9.806_65;
-/// What errs alike in every step.
-pub(super) const LASTING: usize = 18;
 /// How many times what it says a step's own noise may be, where that explains it.
 const ROUGH: f64 = 2.0;
 /// m/s² after a second: an attitude's error moves, with the accelerations that a filter behind it takes for gravity.
 const WALK: f64 = 0.03;
+
+/// Velocity, leak, what the scatter of the steps' vectors added up to (metres, negative), and the newest step's (m/s).
+const STATES: usize = 12;
+const VELOCITY: usize = 0;
+const LEAK: usize = 3;
+const SUM: usize = 6;
+const SCATTER: usize = 9;
+
+type States<const D: usize> = SMatrix<f64, STATES, D>;
 
 /// What accelerometer and attitude say between the steps, body axes at the newest stamp.
 #[derive(Debug, Clone, Copy)]
@@ -41,14 +58,56 @@ pub(super) struct Step {
     pub(super) newer: Stamp,
     /// From the older frame's body axes.
     pub(super) turned: Matrix3<f64>,
-    /// m/s.
+    /// m/s; what is believed of the bias is still in it.
     pub(super) linear: Vector3<f64>,
-    /// Covariance of what is this step's alone, and with the rates.
+    /// Covariance of what is this step's alone, what of it the vectors' scatter makes, and with the rates.
     pub(super) noise: Matrix3<f64>,
+    pub(super) by_vectors: Matrix3<f64>,
     pub(super) with_rates: Matrix3<f64>,
+    /// m/s for one deviation of the gyro's noise about each axis, `gyro_sd` (rad).
+    pub(super) by_gyro: Matrix3<f64>,
+    pub(super) gyro_sd: f64,
     /// What lasts, by column: m/s, and rad/s of the rates.
-    pub(super) lasting: SMatrix<f64, 3, LASTING>,
-    pub(super) rates: SMatrix<f64, 3, LASTING>,
+    pub(super) lasting: Lasting<3>,
+    pub(super) rates: Lasting<3>,
+}
+
+impl Step {
+    /// What a fit says, where `before` was believed of the bias.
+    pub(super) fn new(heard: &Heard, before: &Believed, turn: &Turn, span: Span) -> Step {
+        let spread = before.spread(&heard.lasting);
+        let moved = spread.fixed_rows::<3>(0);
+        let covariance = &heard.covariance;
+        Step {
+            older: span.older,
+            newer: span.newer,
+            turned: *turn.rotation.inverse().to_rotation_matrix().matrix(),
+            linear: heard.linear,
+            noise: covariance.fixed_view::<3, 3>(0, 0) - moved * moved.transpose(),
+            by_vectors: heard.by_vectors,
+            with_rates: covariance.fixed_view::<3, 3>(0, 3) - moved * spread.fixed_rows::<3>(3).transpose(),
+            by_gyro: heard.by_gyro,
+            gyro_sd: turn.variance.sqrt(),
+            lasting: heard.lasting.fixed_rows::<3>(0).into(),
+            rates: heard.lasting.fixed_rows::<3>(3).into(),
+        }
+    }
+
+    fn seconds(&self) -> f64 {
+        self.newer.seconds_since(self.older)
+    }
+
+    /// metres for a radian of the gyro's noise.
+    fn by_gyro(&self) -> Matrix3<f64> {
+        self.by_gyro * if self.gyro_sd > 0.0 { self.seconds() / self.gyro_sd } else { 0.0 }
+    }
+
+    /// The same with as much noise as a step may have.
+    fn rough(&self) -> Step {
+        let [noise, by_vectors, with_rates] =
+            [self.noise, self.by_vectors, self.with_rates].map(|covariance| covariance * (ROUGH * ROUGH));
+        Step { noise, by_vectors, with_rates, ..*self }
+    }
 }
 
 /// A velocity with its covariance, and that with the rates.
@@ -59,20 +118,40 @@ pub(super) struct Weighed {
     pub(super) with_rates: Matrix3<f64>,
 }
 
-/// Velocity and leak as they were believed after the newest step.
+/// A word on some of the states, or on a sum of them.
+struct Word {
+    said: Vector3<f64>,
+    noise: Matrix3<f64>,
+    lasting: Lasting<3>,
+}
+
+/// What was believed after the newest step.
 #[derive(Debug, Clone, Copy)]
 struct Kept {
     older: Stamp,
     newer: Stamp,
-    linear: Vector3<f64>,
-    /// m/s² that is measured and not there, body axes; none before there was a push.
-    leak: Option<Vector3<f64>>,
-    /// Of both, without what lasts, …
-    covariance: Matrix6<f64>,
+    /// The leak, m/s², is measured and not there, body axes; none before there was a push.
+    leaks: bool,
+    mean: SVector<f64, STATES>,
+    /// Without what lasts, …
+    covariance: SMatrix<f64, STATES, STATES>,
     /// … and what lasts.
-    lasting: SMatrix<f64, 6, LASTING>,
+    lasting: Lasting<STATES>,
     /// Whether the newest step contradicted it.
     doubted: bool,
+    /// How far the steps lead since then, if a frame was kept.
+    led: Option<Led>,
+}
+
+/// The sum of the steps' own words since a frame that was kept, the newest body axes.
+#[derive(Debug, Clone, Copy)]
+struct Led {
+    since: Stamp,
+    /// Metres.
+    moved: Vector3<f64>,
+    lasting: Lasting<3>,
+    /// Metres for a radian of the gyro's noise, in the newest step.
+    by_gyro: Matrix3<f64>,
 }
 
 /// The velocity's memory.
@@ -93,230 +172,164 @@ impl Inertia {
     }
 
     /// Weighs a step with what is known from before; `None` where that is nothing, or where the two contradict each other, and the step
-    /// stands alone. `push` is what leads from there to here. An accelerometer is as wrong as `bias_sd` (m/s²) for good.
+    /// stands alone. `push` is what leads from there to here. An accelerometer is as wrong as `bias_sd` (m/s²) for good, and the gyro as
+    /// is `believed` by now.
     ///
     /// Vectors scatter more than they say now and then, by noise that is not that of a bell: a step that twice its noise explains is
     /// weighed with that. One contradiction beyond says that one of the two is wrong, not which: what was known is kept beside. Two in
     /// a row end it.
-    pub(super) fn take(&mut self, step: &Step, push: Option<&Push>, bias_sd: f64) -> Option<Weighed> {
+    pub(super) fn take(
+        &mut self,
+        step: &Step,
+        push: Option<&Push>,
+        bias_sd: f64,
+        believed: &Believed,
+    ) -> Option<Weighed> {
         let carried = push.zip(self.kept).map(|(push, kept)| kept.carried(step, push, bias_sd));
-        let rough =
-            Step { noise: step.noise * (ROUGH * ROUGH), with_rates: step.with_rates * (ROUGH * ROUGH), ..*step };
-        let met = carried.and_then(|carried| carried.met(step).or_else(|| carried.met(&rough)));
-        let doubted = carried.filter(|carried| !carried.doubted).map(|carried| Kept { doubted: true, ..carried });
-        self.kept = met.map(|(kept, _)| kept).or(doubted).or_else(|| Some(Kept::anew(step)));
-        let (kept, heard) = met?;
-        let lasting = kept.lasting.fixed_rows::<3>(0);
+        let met =
+            carried.and_then(|carried| carried.met(step, believed).or_else(|| carried.met(&step.rough(), believed)));
+        let doubted =
+            carried.filter(|carried| !carried.doubted).map(|carried| Kept { doubted: true, led: None, ..carried });
+        self.kept = met.map(|(kept, _)| kept.added(step)).or(doubted).or_else(|| Some(Kept::anew(step)));
+        let (kept, with_rates) = met?;
+        let lasting = kept.lasting.fixed_rows::<3>(VELOCITY).into_owned();
+        let spread = believed.spread(&lasting);
         Some(Weighed {
-            linear: kept.linear,
-            covariance: kept.covariance.fixed_view::<3, 3>(0, 0) + lasting * lasting.transpose(),
-            with_rates: heard * step.with_rates + lasting * step.rates.transpose(),
+            linear: kept.mean.fixed_rows::<3>(VELOCITY) - believed.shift(&lasting),
+            covariance: kept.covariance.fixed_view::<3, 3>(VELOCITY, VELOCITY) + spread * spread.transpose(),
+            with_rates: with_rates + spread * believed.spread(&step.rates).transpose(),
         })
+    }
+
+    /// The newest frame, of this stamp, is kept.
+    pub(super) fn begin(&mut self, stamp: Stamp) {
+        self.kept = self.kept.map(|kept| if kept.newer == stamp { kept.begun() } else { kept });
+    }
+
+    /// Takes how far the body is from where it was when a frame was kept: the step from there to here as if none were between. What does
+    /// not fit to what the steps led to is left alone.
+    pub(super) fn look_back(&mut self, back: &Step, believed: &Believed) {
+        let led = self.kept.filter(|kept| kept.newer == back.newer);
+        let Some((kept, led)) = led.and_then(|kept| Some((kept, kept.led.filter(|led| led.since == back.older)?)))
+        else {
+            return;
+        };
+        // The gyro's noise is the same in both, but for how it is heard.
+        let by_gyro = (back.by_gyro() - led.by_gyro) * back.gyro_sd;
+        let seconds = back.seconds();
+        let word = Word {
+            said: back.linear * seconds - led.moved,
+            noise: back.by_vectors * (seconds * seconds) + by_gyro * by_gyro.transpose(),
+            lasting: back.lasting * seconds - led.lasting,
+        };
+        self.kept = kept.heard(&[SUM], &word, believed).map(|(kept, _)| kept).or(Some(kept));
     }
 }
 
 impl Kept {
     /// The step's word alone.
     fn anew(step: &Step) -> Kept {
-        let (mut covariance, mut lasting) = (Matrix6::zeros(), SMatrix::<f64, 6, LASTING>::zeros());
-        covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&step.noise);
-        lasting.fixed_rows_mut::<3>(0).copy_from(&step.lasting);
-        let Step { older, newer, linear, .. } = *step;
-        Kept { older, newer, linear, leak: None, covariance, lasting, doubted: false }
+        let (mut mean, mut covariance, mut lasting) =
+            (SVector::<f64, STATES>::zeros(), SMatrix::<f64, STATES, STATES>::zeros(), Lasting::<STATES>::zeros());
+        mean.fixed_rows_mut::<3>(VELOCITY).copy_from(&step.linear);
+        covariance.fixed_view_mut::<3, 3>(VELOCITY, VELOCITY).copy_from(&step.noise);
+        lasting.fixed_rows_mut::<3>(VELOCITY).copy_from(&step.lasting);
+        let Step { older, newer, .. } = *step;
+        Kept { older, newer, leaks: false, mean, covariance, lasting, doubted: false, led: None }
+    }
+
+    fn led_by(mut self, by: &SMatrix<f64, STATES, STATES>) -> Kept {
+        self.mean = by * self.mean;
+        self.covariance = by * self.covariance * by.transpose();
+        self.lasting = by * self.lasting;
+        self
     }
 
     /// To the end of a step that begins where this ends.
     fn carried(mut self, step: &Step, push: &Push, bias_sd: f64) -> Kept {
-        let leak = self.leak.unwrap_or_else(|| {
+        if !self.leaks {
             let variance = (GRAVITY * push.up_sd).powi(2) + bias_sd * bias_sd;
-            self.covariance.fixed_view_mut::<3, 3>(3, 3).copy_from(&(Matrix3::identity() * variance));
-            Vector3::zeros()
-        });
-        let mut by = Matrix6::identity();
-        by.fixed_view_mut::<3, 3>(0, 0).copy_from(&step.turned);
-        by.fixed_view_mut::<3, 3>(0, 3).copy_from(&(Matrix3::identity() * -push.seconds));
-        let mut covariance = by * self.covariance * by.transpose();
+            self.covariance.fixed_view_mut::<3, 3>(LEAK, LEAK).copy_from(&(Matrix3::identity() * variance));
+        }
+        let mut by = SMatrix::<f64, STATES, STATES>::identity();
+        by.fixed_view_mut::<3, 3>(VELOCITY, VELOCITY).copy_from(&step.turned);
+        by.fixed_view_mut::<3, 3>(VELOCITY, LEAK).copy_from(&(Matrix3::identity() * -push.seconds));
+        by.fixed_view_mut::<3, 3>(SUM, SUM).copy_from(&step.turned);
+        let mut carried = self.led_by(&by);
+        let mut velocity = carried.mean.fixed_rows_mut::<3>(VELOCITY);
+        velocity += push.change;
         for axis in 0..3 {
-            covariance[(axis, axis)] += push.variance;
-            covariance[(axis + 3, axis + 3)] += WALK * WALK * push.seconds;
+            carried.covariance[(VELOCITY + axis, VELOCITY + axis)] += push.variance;
+            carried.covariance[(LEAK + axis, LEAK + axis)] += WALK * WALK * push.seconds;
         }
-        Kept {
-            older: step.older,
-            newer: step.newer,
-            linear: step.turned * self.linear + push.change - leak * push.seconds,
-            leak: Some(leak),
-            covariance,
-            lasting: by * self.lasting,
-            ..self
-        }
+        Kept { older: step.older, newer: step.newer, leaks: true, ..carried }
     }
 
-    /// Weighed with a step's own word, and by how much that changed the velocity; `None` where the two contradict each other.
-    fn met(self, step: &Step) -> Option<(Kept, Matrix3<f64>)> {
-        let apart = step.lasting - self.lasting.fixed_rows::<3>(0);
-        let surprise = step.linear - self.linear;
-        let total = self.covariance.fixed_view::<3, 3>(0, 0) + step.noise + apart * apart.transpose();
+    /// Weighed with a step's own word, and the covariance of that with the rates; `None` where the two contradict each other.
+    fn met(mut self, step: &Step, believed: &Believed) -> Option<(Kept, Matrix3<f64>)> {
+        self.covariance.fixed_view_mut::<3, 3>(SCATTER, SCATTER).copy_from(&step.by_vectors);
+        let word = Word { said: step.linear, noise: step.noise - step.by_vectors, lasting: step.lasting };
+        let (kept, gain) = self.heard(&[VELOCITY, SCATTER], &word, believed)?;
+        Some((Kept { doubted: false, ..kept }, gain.fixed_rows::<3>(VELOCITY) * step.with_rates))
+    }
+
+    /// Weighed with a word on the sum of the states that begin there, and by how much that changed all of them; `None` where the two
+    /// contradict each other.
+    fn heard(mut self, of: &[usize], word: &Word, believed: &Believed) -> Option<(Kept, States<3>)> {
+        let (mut apart, mut off, mut both) = (word.lasting, word.said, States::<3>::zeros());
+        for at in of {
+            apart -= self.lasting.fixed_rows::<3>(*at);
+            off -= self.mean.fixed_rows::<3>(*at);
+            both += self.covariance.fixed_columns::<3>(*at);
+        }
+        let spread = believed.spread(&apart);
+        let mut total = word.noise + spread * spread.transpose();
+        for at in of {
+            total += both.fixed_rows::<3>(*at);
+        }
         let inverse = invert(&total)?;
+        let surprise = off - believed.shift(&apart);
         // Asked this way round, a NaN is a contradiction.
         let likely = surprise.dot(&(inverse * surprise)) <= GATE;
         if !likely {
             return None;
         }
-        let both: Matrix6x3<f64> = self.covariance.fixed_columns::<3>(0) - self.lasting * apart.transpose();
-        let gain = both * inverse;
-        let mut left = Matrix6::identity();
-        let mut columns = left.fixed_columns_mut::<3>(0);
-        columns -= gain;
-        let change = gain * surprise;
-        let kept = Kept {
-            linear: self.linear + change.fixed_rows::<3>(0),
-            leak: self.leak.map(|leak| leak + change.fixed_rows::<3>(3)),
-            covariance: left * self.covariance * left.transpose() + gain * step.noise * gain.transpose(),
-            lasting: self.lasting + gain * apart,
-            doubted: false,
-            ..self
-        };
-        Some((kept, gain.fixed_rows::<3>(0).into_owned()))
+        let gain = (both - believed.spread(&self.lasting) * spread.transpose()) * inverse;
+        let mut left = SMatrix::<f64, STATES, STATES>::identity();
+        for at in of {
+            let mut columns = left.fixed_columns_mut::<3>(*at);
+            columns -= gain;
+        }
+        self.mean += gain * off;
+        self.covariance = left * self.covariance * left.transpose() + gain * word.noise * gain.transpose();
+        self.lasting += gain * apart;
+        Some((self, gain))
+    }
+
+    /// The step's scatter is added to what it was before.
+    fn added(self, step: &Step) -> Kept {
+        let seconds = step.seconds();
+        let mut by = SMatrix::<f64, STATES, STATES>::identity();
+        by.fixed_view_mut::<3, 3>(SUM, SCATTER).copy_from(&(Matrix3::identity() * -seconds));
+        by.fixed_view_mut::<3, 3>(SCATTER, SCATTER).fill(0.0);
+        let led = self.led.map(|led| Led {
+            moved: step.turned * led.moved + step.linear * seconds,
+            lasting: step.turned * led.lasting + step.lasting * seconds,
+            by_gyro: step.by_gyro(),
+            ..led
+        });
+        Kept { led, ..self.led_by(&by) }
+    }
+
+    /// From now on it is added up.
+    fn begun(self) -> Kept {
+        let mut by = SMatrix::<f64, STATES, STATES>::identity();
+        by.fixed_view_mut::<3, 3>(SUM, SUM).fill(0.0);
+        let zeros = Matrix3::zeros();
+        let led = Led { since: self.newer, moved: Vector3::zeros(), lasting: Lasting::zeros(), by_gyro: zeros };
+        Kept { led: Some(led), ..self.led_by(&by) }
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use rand::{RngExt, SeedableRng};
-    use rand_chacha::ChaCha8Rng;
-
-    use super::*;
-
-    const PERIOD_NS: i64 = 33_000_000;
-    const PERIOD_S: f64 = 0.033;
-    const BIAS_SD: f64 = 0.05;
-
-    /// A word of `noise` (m/s, one deviation) on a velocity, and of `lasting`.
-    fn step(number: i64, linear: Vector3<f64>, noise: f64, lasting: f64) -> Step {
-        let mut columns = SMatrix::<f64, 3, LASTING>::zeros();
-        columns.fixed_view_mut::<3, 3>(0, 0).copy_from(&(Matrix3::identity() * lasting));
-        Step {
-            older: Stamp(number * PERIOD_NS),
-            newer: Stamp((number + 1) * PERIOD_NS),
-            turned: Matrix3::identity(),
-            linear,
-            noise: Matrix3::identity() * noise * noise,
-            with_rates: Matrix3::identity() * 0.25 * noise * noise,
-            lasting: columns,
-            rates: columns * 0.5,
-        }
-    }
-
-    fn push(change: Vector3<f64>) -> Push {
-        Push { change, variance: 1e-6, seconds: PERIOD_S, up_sd: 0.005 }
-    }
-
-    /// Mean normalised error squared over its degrees of freedom, and the deviation of the error, after so many steps.
-    fn after(steps: i64, noise: f64, lasting: f64) -> (f64, f64) {
-        const DRAWS: u64 = 400;
-        let (mut nees, mut square) = (0.0, 0.0);
-        for draw in 0..DRAWS {
-            let mut draws = ChaCha8Rng::seed_from_u64(draw);
-            // Normal as far as it matters here: a sum of twelve.
-            let mut normal = || (0..12).map(|_| draws.random::<f64>()).sum::<f64>() - 6.0;
-            let mut three = |sd: f64| Vector3::from_fn(|_, _| sd * normal());
-            let (shared, mut truth) = (three(lasting), three(1.0));
-            let leak = three(((GRAVITY * 0.005).powi(2) + BIAS_SD * BIAS_SD).sqrt());
-            let mut inertia = Inertia::default();
-            let first = step(0, truth + shared + three(noise), noise, lasting);
-            let mut found = (first.linear, first.noise + first.lasting * first.lasting.transpose());
-            assert!(inertia.take(&first, None, BIAS_SD).is_none(), "the first step stands alone");
-            for number in 1..steps {
-                let change = three(0.1);
-                truth += change;
-                let measured = push(change + leak * PERIOD_S + three(1e-3));
-                assert_eq!(inertia.before(Stamp(number * PERIOD_NS)), Some(Stamp((number - 1) * PERIOD_NS)));
-                let word = step(number, truth + shared + three(noise), noise, lasting);
-                // One in a thousand contradicts by chance, and stands alone.
-                let weighed = inertia.take(&word, Some(&measured), BIAS_SD);
-                let alone = (word.linear, word.noise + word.lasting * word.lasting.transpose());
-                found = weighed.map_or(alone, |weighed| (weighed.linear, weighed.covariance));
-            }
-            let error = found.0 - truth;
-            nees += error.dot(&(found.1.try_inverse().unwrap() * error)) / 3.0;
-            square += error.norm_squared() / 3.0;
-        }
-        (nees / DRAWS as f64, (square / DRAWS as f64).sqrt())
-    }
-
-    #[test]
-    fn steps_together_err_less_than_each_and_say_so() {
-        for (steps, at_most) in [(1, 1.1), (2, 0.8), (10, 0.5), (60, 0.4)] {
-            let (nees, sd) = after(steps, 0.05, 0.0);
-            println!("{steps} steps: {sd:.4} m/s, normalised {nees:.2}");
-            assert!(sd < at_most * 0.05, "{steps} steps: {sd}");
-            assert!((0.75..1.3).contains(&nees), "{steps} steps: {nees}");
-        }
-    }
-
-    #[test]
-    fn what_lasts_is_never_averaged_out() {
-        let (nees, sd) = after(60, 0.05, 0.04);
-        assert!(sd > 0.035 && (0.8..1.25).contains(&nees), "{sd} m/s, {nees}");
-        // Even where there is nothing else.
-        let (nees, sd) = after(60, 1e-4, 0.04);
-        assert!(sd > 0.035 && (0.8..1.25).contains(&nees), "{sd} m/s, {nees}");
-    }
-
-    #[test]
-    fn covariances_with_the_rates_are_those_of_the_parts() {
-        let mut inertia = Inertia::default();
-        let alone = step(0, Vector3::zeros(), 0.05, 0.04);
-        inertia.take(&alone, None, BIAS_SD);
-        for number in 1..40 {
-            inertia.take(&step(number, Vector3::zeros(), 0.05, 0.04), Some(&push(Vector3::zeros())), BIAS_SD);
-        }
-        let late =
-            inertia.take(&step(40, Vector3::zeros(), 0.05, 0.04), Some(&push(Vector3::zeros())), BIAS_SD).unwrap();
-        let lasts = alone.lasting * alone.rates.transpose();
-        // The newest step's own part counts for what it weighs by now; what lasts counts in full.
-        assert!(late.with_rates[(0, 0)] < lasts[(0, 0)] + 0.4 * alone.with_rates[(0, 0)], "{}", late.with_rates);
-        assert!(late.with_rates[(0, 0)] > 0.99 * lasts[(0, 0)], "{}", late.with_rates);
-    }
-
-    #[test]
-    fn a_step_that_scatters_more_than_it_says_counts_for_little() {
-        let still = Vector3::zeros();
-        let last = |struck: f64, noise: f64| {
-            let mut inertia = Inertia::default();
-            for number in 0..20 {
-                inertia.take(&step(number, still, 0.05, 0.0), Some(&push(still)), BIAS_SD);
-            }
-            inertia.take(&step(20, Vector3::new(struck, 0.0, 0.0), noise, 0.0), Some(&push(still)), BIAS_SD).unwrap()
-        };
-        let (rough, fair) = (last(0.35, 0.05), last(0.35, 0.1));
-        assert!((rough.linear - fair.linear).norm() < 1e-12, "{} {}", rough.linear, fair.linear);
-        assert!((rough.covariance - fair.covariance).norm() < 1e-12);
-        // Of its word, less than of one that is as rough as it says.
-        let (less, more) = (rough.linear.x / 0.35, last(0.1, 0.05).linear.x / 0.1);
-        assert!(less > 0.0 && less < 0.4 * more, "{less} {more}");
-    }
-
-    #[test]
-    fn one_contradiction_changes_nothing_and_two_begin_anew() {
-        let mut inertia = Inertia::default();
-        let still = Vector3::zeros();
-        for number in 0..20 {
-            inertia.take(&step(number, still, 0.05, 0.0), Some(&push(still)), BIAS_SD);
-        }
-        let struck = Vector3::new(1.0, 0.0, 0.0);
-        assert!(inertia.take(&step(20, struck, 0.05, 0.0), Some(&push(still)), BIAS_SD).is_none());
-        let next = inertia.take(&step(21, still, 0.05, 0.0), Some(&push(still)), BIAS_SD).unwrap();
-        assert!(next.linear.norm() < 1e-12 && next.covariance[(0, 0)] < 0.4 * 0.05 * 0.05, "{next:?}");
-
-        assert!(inertia.take(&step(22, struck, 0.05, 0.0), Some(&push(still)), BIAS_SD).is_none());
-        assert!(inertia.take(&step(23, struck, 0.05, 0.0), Some(&push(still)), BIAS_SD).is_none());
-        let next = inertia.take(&step(24, struck, 0.05, 0.0), Some(&push(still)), BIAS_SD).unwrap();
-        assert!((next.linear - struck).norm() < 1e-12 && next.covariance[(0, 0)] > 0.4 * 0.05 * 0.05, "{next:?}");
-        // Nor does anything lead over a gap, or from what was forgotten.
-        assert_eq!(inertia.before(Stamp(26 * PERIOD_NS)), None);
-        inertia.forget();
-        assert_eq!(inertia.before(Stamp(25 * PERIOD_NS)), None);
-        assert!(inertia.take(&step(25, still, 0.05, 0.0), Some(&push(still)), BIAS_SD).is_none());
-    }
-}
+mod tests;

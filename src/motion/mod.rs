@@ -13,6 +13,7 @@ mod anchor;
 mod bias;
 mod config;
 mod drift;
+mod errors;
 mod fit;
 mod fusion;
 mod ground;

@@ -7,8 +7,9 @@ use super::{
     anchor::Anchor,
     bias::Bias,
     drift::{Turned, Watch},
+    errors::Alike,
     fit::{Fit, Found},
-    fusion::Alike,
+    fusion::Seen,
     ground::Ranges,
     gyro::{Rates, Turn},
     inertia::Inertia,
@@ -241,7 +242,7 @@ impl Odometer {
             ground.normal = (ground.normal + a * found.lean[0] + b * found.lean[1]).normalize();
             ground.distance = self.distance(span, &ground.normal);
         }
-        let velocity = self.conclude(&turn, &ground, &found, span, alike);
+        let velocity = self.conclude(&Seen { turn: &turn, ground: &ground, found: &found, span, alike });
         Ok(Velocity { older: flow.older, newer: flow.newer, ..velocity })
     }
 
