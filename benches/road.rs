@@ -154,7 +154,7 @@ fn report(count: usize) -> Result<(), String> {
     let (refined, _) = plain(&config);
     config.flow.refine = false;
     // It takes the gyro at its word, so ours does not follow what the vectors show of the turn, though it looks.
-    config.motion.ground_bend_sd = 1e6;
+    (config.motion.ground_bend_sd, config.motion.ground_slope_sd) = (1e6, 1e6);
     let (times, last) = plain(&config);
     let [best, median] = [times[0], times[times.len() / 2]];
     let real = Matcher::open(&config.flow).map_err(|error| error.to_string())?;

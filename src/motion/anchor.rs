@@ -26,7 +26,7 @@ use crate::{
 const AGE_S_MAX: f64 = 2.0;
 /// It is first compared after so many intervals, and again after so many times as long.
 const INTERVALS: f64 = 1.5;
-const LONGER: f64 = 1.5;
+const LONGER: f64 = 1.35;
 /// Motion along the ground, over the distance to it, and turn, rad, after which too little of it is in sight.
 const MOVED_MAX: f64 = 0.2;
 const TURNED_MAX: f64 = 0.35;

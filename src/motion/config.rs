@@ -82,9 +82,10 @@ pub struct Config {
     pub flow_shared_sd_part: f64,
     /// By how much an error that cells share may differ over the image where gradients have the last word, in such cells.
     pub flow_bend_sd_cells: f64,
-    /// How far the ground may be from a level plane: by what part of the distance it bends where a ray's slope is 1, and how much it may
-    /// slope where the gyro's bias is learnt.
+    /// How far the ground may be from a plane: by what part of the distance it bends where a ray's slope is 1.
     pub ground_bend_sd: f64,
+    /// How much the ground may slope, where the gyro's bias is learnt.
+    pub ground_slope_sd: f64,
     /// By what part of the distance things may stand above the ground that vectors are too noisy to tell from it.
     pub ground_relief_sd: f64,
     /// Clocks of gyro and camera that are further apart than this are said to be so.
@@ -175,6 +176,7 @@ impl Default for Config {
             flow_shared_sd_part: 0.001,
             flow_bend_sd_cells: 0.002,
             ground_bend_sd: 0.05,
+            ground_slope_sd: 0.03,
             ground_relief_sd: 0.02,
             clock_offset_s_max: 0.002,
             turn_scale_off_max: 0.1,
@@ -252,6 +254,11 @@ pub const REASONS: &[(&str, &str)] = &[
     (
         "ground_bend_sd",
         "a bulge of 5 cm a metre beside the image's middle: lawns and roads bend less, heaps and ditches more",
+    ),
+    (
+        "ground_slope_sd",
+        "roads fall by 2 to 2.5 % to the side, lawns and yards by 1 to 2 %; on a hillside a climb shows a gyro's bias that isn't there until it \
+         ends, by as much of its speed as the slope is more",
     ),
     (
         "ground_relief_sd",

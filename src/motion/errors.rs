@@ -267,10 +267,10 @@ impl Odometer {
     }
 
     /// How the turn that is left changes with the slope of the ground, a deviation of it in either direction: climbing over a slope
-    /// bends the vectors as a turn does. Ground that bulges by so much where a ray's slope is 1 slopes by as much.
+    /// bends the vectors as a turn does.
     pub(super) fn by_slope(&self, ground: &Ground, found: &Found) -> Matrix3x2<f64> {
         let by_normal = found.leftover.as_ref().map_or_else(Matrix3::zeros, |left| left.by_normal);
-        let tangents = ground.tangents.map(|tangent| self.mount.inverse() * tangent * self.config.ground_bend_sd);
+        let tangents = ground.tangents.map(|tangent| self.mount.inverse() * tangent * self.config.ground_slope_sd);
         by_normal * Matrix3x2::from_columns(&tangents)
     }
 }

@@ -27,7 +27,7 @@ fn settings(keyframes: bool) -> Config {
     config.exposure.white_level = Some(f32::from(WHITE));
     config.motion.keyframes = keyframes;
     // The flight's ground is level. Who does not know that takes a while to tell climbing over a slope from turning.
-    config.motion.ground_bend_sd = 0.01;
+    (config.motion.ground_bend_sd, config.motion.ground_slope_sd) = (0.01, 0.01);
     config
 }
 

@@ -127,7 +127,7 @@ fn the_covariance_is_that_of_the_cells_own_noise() {
     (config.gyro_sd_rad_s, config.gyro_bias_sd_rad_s, config.attitude_sd_rad) = (1e-6, 0.0, 1e-7);
     (config.range_sd_m, config.range_sd_part, config.climb_sd_m_s) = (1e-6, 0.0, 0.0);
     (config.flow_shared_sd_cells, config.flow_shared_sd_part, config.flow_bend_sd_cells) = (0.0, 0.0, 0.0);
-    (config.ground_bend_sd, config.ground_relief_sd) = (0.0, 0.0);
+    (config.ground_bend_sd, config.ground_slope_sd, config.ground_relief_sd) = (0.0, 0.0, 0.0);
     let mut seen = truth.exact();
     let (mut draws, mut sum) = (Normals::new(9, 0), 0.0);
     // Vectors that scatter so much have no say.

@@ -150,7 +150,8 @@ fn a_bias_shows_in_what_is_kept_and_is_taken_off() {
     let bias = Vector3::new(0.004, -0.005, 0.002);
     let off = |compares: bool| {
         // Over ground that bends no drift would tell a turn from it.
-        let mut hover = Hover::new(Config { ground_bend_sd: 0.005, ..Config::default() }, drifting(), bias);
+        let mut hover =
+            Hover::new(Config { ground_bend_sd: 0.005, ground_slope_sd: 0.005, ..Config::default() }, drifting(), bias);
         hover.step();
         let mut last = Vector3::zeros();
         for _ in 2..40 {
