@@ -9,7 +9,7 @@
 //! taken off in the end, from everything that was kept.
 //!
 //! Vectors scatter anew in every step, and their sum over a hover wanders. How far the body has moved since a frame that was kept
-//! ([`Back`]) ends that: by how much the steps' scatter added up is fitted too, and what it turns out to be was in part the newest's.
+//! (`Inertia::look_back`) ends that: by how much the steps' scatter added up is fitted too, and what it turns out to be was in part the newest's.
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 
@@ -97,7 +97,7 @@ impl Step {
         self.newer.seconds_since(self.older)
     }
 
-    /// metres for a radian of the gyro's noise.
+    /// Metres for a radian of the gyro's noise.
     fn by_gyro(&self) -> Matrix3<f64> {
         self.by_gyro * if self.gyro_sd > 0.0 { self.seconds() / self.gyro_sd } else { 0.0 }
     }
@@ -206,8 +206,8 @@ impl Inertia {
         self.kept = self.kept.map(|kept| if kept.newer == stamp { kept.begun() } else { kept });
     }
 
-    /// Takes how far the body is from where it was when a frame was kept: the step from there to here as if none were between. What does
-    /// not fit to what the steps led to is left alone.
+    /// Takes how far the body is from where it was when a frame was kept: `back` leads from there to here, as if no step were between. What
+    /// does not fit what the steps led to is left alone.
     pub(super) fn look_back(&mut self, back: &Step, believed: &Believed) {
         let led = self.kept.filter(|kept| kept.newer == back.newer);
         let Some((kept, led)) = led.and_then(|kept| Some((kept, kept.led.filter(|led| led.since == back.older)?)))
