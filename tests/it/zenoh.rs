@@ -114,10 +114,12 @@ fn a_slow_taker_gets_the_newest_frame() {
     for round in 1..=4u64 {
         camera.say("frames 12 200");
         camera.line_starting(&format!("sent {}", round * 12 - 1), LONG);
-        until("all frames of the round", || source.counts().arrived == round * 12);
+        // A frame is there a moment after it is counted, and before the one that it displaced is.
+        until("all frames of the round", || {
+            (source.counts().arrived, source.counts().displaced) == (round * 12, round * 11)
+        });
         let Next::Sample(sample) = source.next(LONG).unwrap() else { panic!("no frame") };
         assert_eq!(index(&sample), round * 12 - 1, "after a pause the newest frame is given");
-        assert_eq!(source.counts().displaced, round * 11);
         assert_eq!(source.next(SHORT).unwrap(), Next::Idle, "nothing older follows");
     }
 }
