@@ -8,7 +8,7 @@ use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 
 use super::{
     Odometer, Scale, Velocity,
-    bias::{Believed, Bias, Shown},
+    bias::{Bias, Shown},
     fit::Found,
     fusion::Seen,
     gyro::Turn,
@@ -163,6 +163,7 @@ impl Odometer {
         }
     }
 
+    /// What both frames show of the bias, and how far the body has moved between them, as one step; `None` where that is none of these.
     fn weigh(
         &mut self,
         anchor: &Anchor,
@@ -183,51 +184,37 @@ impl Odometer {
             found = self.seen_from(flow, gradients, &turn, &ground, &angle)?;
         }
         let left = found.leftover.as_ref()?;
-        let removed = angle;
-        angle += self.mount * left.angle;
         let alike = self.alike(&found, f64::from(flow.grid.scale[0]) / focal);
         let seen = Seen { turn: &turn, ground: &ground, found: &found, span, alike };
-        let (to_body, bulge) = (self.mount.matrix(), self.bulge(&seen));
-        let mut noise = Matrix3::identity() * (bulge * bulge) + to_body * left.covariance * to_body.transpose();
-        for error in self.turn_errors(&turn) {
-            noise += error * error.transpose();
-        }
-        for (axis, sd) in alike.shared_sds().into_iter().enumerate() {
-            let error = to_body * left.by_shared.column(axis) * sd;
-            noise += error * error.transpose();
-        }
-        // The bias turned with the body.
-        let half = UnitQuaternion::identity().slerp(&turn.rotation, 0.5).inverse().to_rotation_matrix();
-        let to_middle = half * self.mount;
+        let (to_camera, to_body) = (self.mount.inverse(), self.mount.matrix());
+        let mut fit = self.fitted(&seen);
+        // As if nothing had been taken off the turn.
+        fit.linear += fit.by_turn(&found, to_camera.matrix(), span.seconds) * angle;
+        let shown = to_camera * angle + left.angle;
         let mut bias = anchor.before;
-        bias.pass(span.seconds, ground.passed(&(self.mount * found.tau), &turn));
+        bias.pass(span.seconds, fit.passed);
         let before = bias.believed();
+        let errors = self.errors(&before, &seen, &fit);
+        let bulge = self.bulge(&seen);
+        let noise = errors.passing() + left.covariance + Matrix3::identity() * (bulge * bulge);
+        // The bias turned with the body.
+        let half = UnitQuaternion::identity().slerp(&turn.rotation, 0.5).inverse().to_rotation_matrix().into_inner();
+        let to_middle = half * to_body;
         let likely = bias.take(&Shown {
-            angle: half * angle,
+            angle: to_middle * shown,
             interval_s: span.seconds,
-            noise: half.matrix() * noise * half.matrix().transpose(),
-            by_slope: to_middle.matrix() * self.by_slope(&ground, &found),
+            noise: to_middle * noise * to_middle.transpose(),
+            by_slope: to_middle * self.by_slope(&ground, &found),
             bent: alike.bent,
         });
         if !likely {
             self.bias.doubt();
-        }
-        likely.then(|| (bias, self.back(&before, &seen, &removed)))
-    }
-
-    /// How far the body has moved since the frame was kept, as one step, where that is known in metres. `before` is believed of the bias
-    /// but for these two frames; `removed` was taken off the turn before they were looked at.
-    fn back(&self, before: &Believed, seen: &Seen<'_>, removed: &Vector3<f64>) -> Option<Step> {
-        if !self.leads() || seen.ground.distance.is_err() {
             return None;
         }
-        let Seen { turn, found, span, .. } = *seen;
-        let (left, to_camera) = (found.leftover.as_ref()?, self.mount.inverse());
-        let mut fit = self.fitted(seen);
-        fit.linear += fit.by_turn(found, to_camera.matrix(), span.seconds) * removed;
-        let angle = to_camera * removed + left.angle;
-        let heard = self.errors(before, seen, &fit).heard(found, left, &fit, self.bulge(seen), &angle)?;
-        Some(Step::new(&heard, before, turn, span))
+        // How far the body has moved, where that is known in metres.
+        let metric = self.leads() && ground.distance.is_ok();
+        let heard = metric.then(|| errors.heard(&found, left, &fit, bulge, &shown)).flatten();
+        Some((bias, heard.map(|heard| Step::new(&heard, &before, &turn, span))))
     }
 
     /// What both frames show once the gyro's turn, less `angle` (body axes of the kept frame), is taken off.

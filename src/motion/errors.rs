@@ -202,7 +202,7 @@ pub(super) struct Alike {
 
 impl Alike {
     /// Of a shift right and down, and of a stretch.
-    pub(super) fn shared_sds(&self) -> [f64; 3] {
+    fn shared_sds(&self) -> [f64; 3] {
         [self.shared, self.shared, STRETCHED * self.bent]
     }
 }
@@ -259,7 +259,7 @@ impl Odometer {
     }
 
     /// By what the gyro's turn may be off, in the older body axes, rad: its noise (3), its clock, and the stamps of both frames.
-    pub(super) fn turn_errors(&self, turn: &Turn) -> [Vector3<f64>; 6] {
+    fn turn_errors(&self, turn: &Turn) -> [Vector3<f64>; 6] {
         let [x, y, z] = std::array::from_fn(|axis| Vector3::ith(axis, turn.variance.sqrt()));
         let jitter = self.config.stamp_jitter_sd_s;
         let late = (turn.last - turn.first) * self.config.gyro_offset_sd_s;

@@ -49,7 +49,7 @@ impl Odometer {
             unobserved(&mut covariance);
         }
         if self.leads() && turn.swing_variance.is_some() && ground.distance.is_ok() {
-            self.carry(&mut linear, &mut covariance, &heard, &believed, turn, span);
+            self.carry(&mut linear, &mut covariance, &heard, &believed, seen);
         } else {
             self.inertia.forget();
         }
@@ -145,9 +145,9 @@ impl Odometer {
         covariance: &mut Matrix6<f64>,
         heard: &Heard,
         before: &Believed,
-        turn: &Turn,
-        span: Span,
+        seen: &Seen<'_>,
     ) {
+        let Seen { turn, span, .. } = *seen;
         let push = self
             .inertia
             .before(span.older)
