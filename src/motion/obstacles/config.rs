@@ -43,6 +43,8 @@ pub struct Config {
     pub mover_px_min: f64,
     /// The fewest connected cells that make something that moves.
     pub mover_cells_min: usize,
+    /// Whether long thin things are looked for, which are narrower than a cell of the flow: wires, guys, rods.
+    pub thin: bool,
 }
 
 impl Default for Config {
@@ -66,6 +68,7 @@ impl Default for Config {
             mover_sds: 4.0,
             mover_px_min: 0.5,
             mover_cells_min: 9,
+            thin: true,
         }
     }
 }
@@ -99,6 +102,7 @@ pub const REASONS: &[(&str, &str)] = &[
     ("obstacles.mover_sds", "one of 16,000 vectors of what stands still, were they independent"),
     ("obstacles.mover_px_min", "half a pixel of the network's image is what rotation and calibration leave"),
     ("obstacles.mover_cells_min", "three by three: what a divergence can be fitted to"),
+    ("obstacles.thin", "a wire is a pixel wide: what is seen around it would call it free"),
 ];
 
 #[cfg(test)]

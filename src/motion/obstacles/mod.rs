@@ -9,9 +9,11 @@ mod cell;
 mod config;
 mod heading;
 mod mover;
+mod ridge;
 mod sector;
 mod surface;
 mod texture;
+mod thin;
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 
@@ -28,6 +30,7 @@ use heading::{Memory, Search};
 use mover::Movers;
 use sector::{Corridor, Sectors};
 use texture::Texture;
+use thin::{Step, Things};
 
 /// Sectors of five degrees; sector k looks along −π + k · 2π/72, counter-clockwise from above, so that 36 looks forward.
 pub const SECTORS: usize = 72;
@@ -35,6 +38,9 @@ pub const SECTORS: usize = 72;
 /// A speed that may be off by more than this part of itself makes no distances: where a wall fills the view there is no
 /// ground to measure it by.
 const SPEED_SD_PART_MAX: f64 = 0.25;
+
+/// The velocity's direction and that of the flow are of one motion where they are within so many deviations.
+const DIRECTION_SDS: f64 = 4.0;
 
 /// The most cells that are looked at; a finer raster is thinned evenly.
 const CELLS_MAX: usize = 8000;
@@ -135,6 +141,7 @@ pub struct Lookout {
     texture: Texture,
     movers: Movers,
     sectors: Sectors,
+    things: Things,
     memory: Option<(Stamp, Memory)>,
     /// When speed was last known well, and how fast it was then.
     speed: Option<(Stamp, f64)>,
@@ -176,6 +183,7 @@ impl Lookout {
             texture: Texture::default(),
             movers: Movers::default(),
             sectors: Sectors::new(),
+            things: Things::default(),
             memory: None,
             speed: None,
             newest: None,
@@ -242,10 +250,32 @@ impl Lookout {
         self.sectors.gather(&self.cells, &scene, &corridor);
         self.sectors.update(&self.cells, &scene, &corridor);
         self.closing.extend(self.cells.iter().map(|cell| if cell.known { cell.closing as f32 } else { f32::NAN }));
+        let mut sectors = self.sectors.conclude(&self.config, &corridor);
+        if self.config.thin {
+            let fitted = metric(velocity).and(velocity.as_ref().ok()).map(|velocity| Vector3::from(velocity.linear));
+            let fitted = fitted.and_then(|linear| (body.transpose() * linear).try_normalize(1e-6));
+            // Where the ground shows the velocity its direction is the better known one of the two.
+            let near = |fitted: &Vector3<f64>| fitted.dot(&heading.direction) > (DIRECTION_SDS * sd_rad).cos();
+            let direction = fitted.filter(near).unwrap_or(heading.direction);
+            let step = Step {
+                older: flow.older,
+                newer: flow.newer,
+                path: direction * (speed.unwrap_or(1.0) * sighting.interval_s),
+                metric: speed.is_some(),
+                interval_s: sighting.interval_s,
+                turn: sighting.mount.transpose() * body,
+                heading_sd_rad: sd_rad,
+                drift_sd_rad_s: odometer.config.gyro_bias_sd_rad_s,
+                pixel,
+            };
+            self.things.look(older, odometer.lens(camera_size)?, &step);
+            let path = level * body * heading.direction;
+            self.things.tell(&mut sectors, &(level * sighting.mount), &path, &self.config, &corridor);
+        }
         Ok(Obstacles {
             older: flow.older,
             newer: flow.newer,
-            sectors: self.sectors.conclude(&self.config, &corridor),
+            sectors,
             heading: (level * body * heading.direction).into(),
             heading_sd_rad: sd_rad,
             speed,

@@ -69,7 +69,7 @@ impl Corridor {
     }
 
     /// Inverse time at which a ray of this slope leaves the corridor; infinite where nothing is known of it.
-    fn leaves(&self, config: &Config, slope: f64) -> f64 {
+    pub(super) fn leaves(&self, config: &Config, slope: f64) -> f64 {
         match self.speed {
             Some(speed) => speed * if slope < 0.0 { -slope / config.below_m } else { slope / config.above_m },
             None if slope.abs() <= config.elevation_rad_max => 0.0,

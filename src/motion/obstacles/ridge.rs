@@ -1,0 +1,264 @@
+//! Long thin lines in one frame, which no cell of the flow can hold: a wire is a pixel wide and hundreds long.
+//!
+//! The image is summed along short pieces of line, TILE pixels long, of every slope (a discrete Radon transform by tiles);
+//! a piece is a ridge where the sum is above, or below, what lies beside it on both sides, so that an edge is none. Pieces
+//! that lie on one line make a ridge, also where what is behind hides some of them.
+
+use super::super::lens::Lens;
+use crate::exposure::Exposed;
+
+/// Length of a piece, developed pixels.
+const TILE: usize = 32;
+/// Slopes from −1 to 1: over half a piece two neighbours part by half a pixel.
+const SLOPES: i32 = 16;
+/// What lies beside a ridge is looked at this far from its middle, developed pixels: a wire is narrower.
+const BESIDE: usize = 2;
+/// How strong a ridge is counts against the median of what is within this many pixels of it.
+const AROUND: usize = 12;
+/// A piece stands out by so many deviations of what is around it, …
+const STRENGTH_MIN: f32 = 3.0;
+/// … and by this part of white.
+const CONTRAST_MIN: f32 = 0.004;
+/// One piece counts for no more than this, or a kerb would make a line with anything.
+const STRENGTH_MAX: f32 = 8.0;
+/// Pieces that are kept of each tile.
+const PEAKS: usize = 6;
+/// Pieces lie on a line within this, pixels, and have its slope within this.
+const ON_LINE_PX: f64 = 0.8;
+const ON_LINE_SLOPE: f64 = 0.08;
+/// The fewest pieces of a line.
+const PIECES_MIN: usize = 4;
+/// Lines that are looked for, level and upright ones each.
+const LINES_MAX: usize = 4;
+/// Median of a standard normal's absolute value.
+const MEDIAN_ABS: f32 = 0.674_489_8;
+
+/// A line, as rays (x, y, 1) of its two ends.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Ridge {
+    pub(super) ends: [[f64; 2]; 2],
+    /// Brighter than what is beside it, or darker.
+    pub(super) bright: bool,
+}
+
+/// The strongest piece through a place of a tile's middle.
+#[derive(Debug, Clone, Copy, Default)]
+struct Piece {
+    /// Signed, in deviations of what is around it.
+    strength: f32,
+    slope: f32,
+    /// From the pixel to the ridge's top.
+    offset: f32,
+}
+
+/// A piece that stands out, its middle freed from the lens' distortion.
+#[derive(Debug, Clone, Copy)]
+struct Peak {
+    tile: usize,
+    /// Along and across, developed pixels from the optical axis.
+    at: [f64; 2],
+    slope: f64,
+    strength: f32,
+    used: bool,
+}
+
+/// Scratch memory.
+#[derive(Debug, Default)]
+pub(super) struct Ridges {
+    /// Grey, so that what lies across the lines is contiguous: along × across.
+    plane: Vec<f32>,
+    breadth: usize,
+    sums: Vec<f32>,
+    spread: Vec<f32>,
+    window: Vec<f32>,
+    pieces: Vec<Piece>,
+    peaks: Vec<Peak>,
+}
+
+impl Ridges {
+    /// Appends what a developed frame shows.
+    pub(super) fn find(&mut self, image: &Exposed, lens: &Lens, found: &mut Vec<Ridge>) {
+        let focal = lens.focal() / f64::from(image.scale[0]);
+        for upright in [false, true] {
+            self.lay(image, upright);
+            self.peaks.clear();
+            let tiles = if upright { image.height } else { image.width } / TILE;
+            for tile in 0..tiles {
+                self.search(tile);
+                let middle = (tile * TILE) as f64 + 0.5 * (TILE as f64 - 1.0);
+                let freed = |across: f64| {
+                    let at = if upright { [across, middle] } else { [middle, across] };
+                    let pixel = [0, 1].map(|i| (at[i] + 0.5) * f64::from(image.scale[i]) - 0.5);
+                    let ray = lens.ray(pixel)?.map(|side| side * focal);
+                    Some(if upright { [ray[1], ray[0]] } else { ray })
+                };
+                self.stand_out(tile, freed);
+            }
+            for _ in 0..LINES_MAX {
+                let Some((bright, ends)) = self.line() else { break };
+                let ray = |[along, across]: [f64; 2]| if upright { [across, along] } else { [along, across] };
+                found.push(Ridge { bright, ends: ends.map(|end| ray(end).map(|side| side / focal)) });
+            }
+        }
+    }
+
+    /// Grey, by columns where lines run across the image, by rows where they stand.
+    fn lay(&mut self, image: &Exposed, upright: bool) {
+        let (width, height) = (image.width, image.height);
+        let size = width * height;
+        self.breadth = if upright { width } else { height };
+        self.plane.clear();
+        self.plane.resize(size, 0.0);
+        let [red, green, blue] = [0, 1, 2].map(|c| image.rgb.get(c * size..(c + 1) * size).unwrap_or_default());
+        for (at, ((r, g), b)) in red.iter().zip(green).zip(blue).enumerate() {
+            let place = if upright { at } else { at % width * height + at / width };
+            self.plane[place] = (r + g + b) / 3.0;
+        }
+    }
+
+    /// The strongest piece through each place of the tile's middle line.
+    fn search(&mut self, tile: usize) {
+        let breadth = self.breadth;
+        self.pieces.clear();
+        self.pieces.resize(breadth, Piece::default());
+        self.sum(tile, 0.0);
+        self.scale();
+        for step in -SLOPES..=SLOPES {
+            let slope = step as f32 / SLOPES as f32;
+            self.sum(tile, slope);
+            let margin = BESIDE + 1 + (slope.abs() * 0.5 * TILE as f32).ceil() as usize;
+            for y in margin..breadth.saturating_sub(margin) {
+                let beside = [self.sums[y] - self.sums[y - BESIDE], self.sums[y] - self.sums[y + BESIDE]];
+                if beside[0] * beside[1] <= 0.0 {
+                    continue;
+                }
+                let least = beside[0].abs().min(beside[1].abs());
+                let strength = least / self.spread[y];
+                if least >= CONTRAST_MIN && strength > self.pieces[y].strength.abs() {
+                    let top = [y - 1, y, y + 1].map(|y| self.curved(y).abs());
+                    let bend = top[0] - 2.0 * top[1] + top[2];
+                    let offset = if bend < 0.0 { 0.5 * (top[0] - top[2]) / bend } else { 0.0 };
+                    let strength = strength.copysign(beside[0]);
+                    self.pieces[y] = Piece { strength, slope, offset: offset.clamp(-0.6, 0.6) };
+                }
+            }
+        }
+    }
+
+    /// Means along pieces of one slope, by where they cross the tile's middle; what leaves the image is left out.
+    fn sum(&mut self, tile: usize, slope: f32) {
+        let breadth = self.breadth;
+        self.sums.clear();
+        self.sums.resize(breadth, 0.0);
+        for along in 0..TILE {
+            let shift = (slope * (along as f32 - 0.5 * (TILE as f32 - 1.0))).round() as isize;
+            let line = &self.plane[(tile * TILE + along) * breadth..][..breadth];
+            let aside = shift.unsigned_abs().min(breadth);
+            let (to, from) = match shift >= 0 {
+                true => (&mut self.sums[..breadth - aside], &line[aside..]),
+                false => (&mut self.sums[aside..], &line[..breadth - aside]),
+            };
+            for (sum, value) in to.iter_mut().zip(from) {
+                *sum += value * (1.0 / TILE as f32);
+            }
+        }
+    }
+
+    /// By how much a mean is above both sides' mean.
+    fn curved(&self, y: usize) -> f32 {
+        self.sums[y] - 0.5 * (self.sums[y - BESIDE] + self.sums[y + BESIDE])
+    }
+
+    /// What is usual around each place: noise in the sky, texture on the ground.
+    fn scale(&mut self) {
+        let (breadth, sides) = (self.breadth, BESIDE..self.breadth.saturating_sub(BESIDE));
+        self.spread.clear();
+        self.spread.resize(breadth, f32::INFINITY);
+        for y in sides.clone() {
+            let near = y.saturating_sub(AROUND).max(sides.start)..(y + AROUND + 1).min(sides.end);
+            self.window.clear();
+            for y in near {
+                self.window.push(self.curved(y).abs());
+            }
+            let middle = self.window.len() / 2;
+            let (_, median, _) = self.window.select_nth_unstable_by(middle, f32::total_cmp);
+            self.spread[y] = (*median / MEDIAN_ABS).max(1e-6);
+        }
+    }
+
+    /// Keeps the tile's strongest pieces.
+    fn stand_out(&mut self, tile: usize, freed: impl Fn(f64) -> Option<[f64; 2]>) {
+        let first = self.peaks.len();
+        let strength = |y: usize| self.pieces.get(y).map_or(0.0, |piece| piece.strength.abs());
+        for (y, piece) in self.pieces.iter().enumerate() {
+            let own = piece.strength.abs();
+            let top = (y.saturating_sub(2)..y).all(|y| strength(y) < own) && (y + 1..y + 3).all(|y| strength(y) <= own);
+            if own < STRENGTH_MIN || !top {
+                continue;
+            }
+            if let Some(at) = freed(y as f64 + f64::from(piece.offset)) {
+                let (slope, strength) = (f64::from(piece.slope), piece.strength);
+                self.peaks.push(Peak { tile, at, slope, strength, used: false });
+            }
+        }
+        self.peaks[first..].sort_unstable_by(|a, b| b.strength.abs().total_cmp(&a.strength.abs()));
+        self.peaks.truncate(first + PEAKS);
+    }
+
+    /// The line on which the strongest pieces lie that no line has yet: whether it is bright, and where it begins and ends.
+    fn line(&mut self) -> Option<(bool, [[f64; 2]; 2])> {
+        let mut best = None::<(f32, usize, f64)>;
+        for (i, p) in self.peaks.iter().enumerate() {
+            for q in self.peaks.iter().filter(|q| q.tile >= p.tile + 2) {
+                let slope = (q.at[1] - p.at[1]) / (q.at[0] - p.at[0]);
+                if !self.on(p, q, slope) || !self.on(p, p, slope) {
+                    continue;
+                }
+                let (mut score, mut pieces) = (0.0, 0);
+                self.along(p, slope, |peak| {
+                    (score, pieces) = (score + peak.strength.abs().min(STRENGTH_MAX), pieces + 1);
+                });
+                if pieces >= PIECES_MIN && best.is_none_or(|best| score > best.0) {
+                    best = Some((score, i, slope));
+                }
+            }
+        }
+        let (_, index, slope) = best?;
+        let seed = self.peaks[index];
+        let (mut n, mut x, mut y, mut xx, mut xy) = (0.0, 0.0, 0.0, 0.0, 0.0);
+        let mut reach = [f64::INFINITY, f64::NEG_INFINITY];
+        self.along(&seed, slope, |peak| {
+            let [along, across] = peak.at;
+            (n, x, y, xx, xy) = (n + 1.0, x + along, y + across, xx + along * along, xy + along * across);
+            reach = [reach[0].min(along), reach[1].max(along)];
+        });
+        let slope = (n * xy - x * y) / (n * xx - x * x);
+        let at = |along: f64| [along, (y + slope * (n * along - x)) / n];
+        for peak in &mut self.peaks {
+            peak.used |= (peak.at[1] - at(peak.at[0])[1]).abs() < 3.0 * ON_LINE_PX;
+        }
+        let half = 0.5 * TILE as f64;
+        Some((seed.strength > 0.0, [at(reach[0] - half), at(reach[1] + half)]))
+    }
+
+    /// Whether `peak` lies on the line through `seed`.
+    fn on(&self, seed: &Peak, peak: &Peak, slope: f64) -> bool {
+        let off = peak.at[1] - seed.at[1] - slope * (peak.at[0] - seed.at[0]);
+        !peak.used
+            && seed.strength * peak.strength > 0.0
+            && off.abs() < ON_LINE_PX
+            && (peak.slope - slope).abs() < ON_LINE_SLOPE
+    }
+
+    /// The strongest piece of each tile on the line through `seed`.
+    fn along(&self, seed: &Peak, slope: f64, mut take: impl FnMut(&Peak)) {
+        let mut next = 0;
+        for peak in &self.peaks {
+            if peak.tile >= next && self.on(seed, peak, slope) {
+                // A tile's pieces stand in the order of their strength.
+                next = peak.tile + 1;
+                take(peak);
+            }
+        }
+    }
+}
