@@ -21,7 +21,7 @@ use super::{
 };
 
 /// What the drone flies at.
-pub const COURSES: [&str; 4] = ["wall", "poles", "wire", "moving"];
+pub const COURSES: [&str; 5] = ["wall", "poles", "wire", "rods", "moving"];
 /// Mean of the clean frames, from which the ladder's are made: no highlight is lost.
 const CLEAN: f64 = 0.1;
 /// No obstacle for the whole flight.
@@ -54,6 +54,11 @@ pub fn fly(plan: &Plan) -> Result<Flown, String> {
             .map(|k| Thing::pole(within(12.0, 16.0), (f64::from(k) - 1.0) * 3.0 + within(-1.0, 1.0), within(0.25, 0.6)))
             .collect(),
         "wire" => vec![Thing::wire(within(13.0, 15.0), within(3.8, 4.3), within(0.02, 0.04))],
+        "rods" => (0..3)
+            .map(|k| {
+                Thing::pole(within(12.0, 16.0), (f64::from(k) - 1.0) * 2.5 + within(-1.0, 1.0), within(0.02, 0.04))
+            })
+            .collect(),
         _ => vec![
             Thing::pole(within(15.0, 17.0), within(-5.0, -4.0), 0.8).moving([0.0, within(0.7, 1.1), 0.0]),
             Thing::pole(within(18.0, 20.0), within(1.5, 2.5), 1.0).moving([within(-1.5, -1.0), 0.0, 0.0]),

@@ -215,20 +215,20 @@ impl Lookout {
         self.fill(odometer, flow, camera_size, older, &sighting)?;
         let body = sighting.turn.inverse().to_rotation_matrix().matrix() * sighting.mount;
         let level = levelled(&sighting.up);
-        let yaw = yaw(&level, &sighting.turn);
-        self.sectors.predict(sighting.interval_s, yaw, &self.config);
+        self.sectors.predict(sighting.interval_s, yaw(&level, &sighting.turn), &self.config);
         let seen = self.cells.iter().filter(|cell| cell.seen).count() as u32;
         let needed = self.config.cells_min.max(2) as u32;
+        let bare = NoSight::Bare { seen, cells: self.cells.len() as u32, needed };
         if seen < needed {
-            return Err(NoSight::Bare { seen, cells: self.cells.len() as u32, needed });
+            return Err(bare);
         }
-        let heading = self.heading(odometer, flow, &sighting, &body, velocity, pixel);
-        let heading = heading.ok_or(NoSight::Bare { seen, cells: self.cells.len() as u32, needed })?;
+        let heading = self.heading(odometer, flow, &sighting, &body, velocity, pixel).ok_or(bare)?;
         let (sd_rad, allowed_rad) = (heading.sd(), self.config.heading_sd_rad_max);
         if !sd_rad.is_finite() || sd_rad > allowed_rad {
             return Err(NoSight::Parallax { sd_rad, allowed_rad });
         }
         self.memory = heading.remember(&body).map(|memory| (flow.newer, memory));
+        let speed = self.hold_speed(flow.newer, velocity);
         let scene = Scene {
             config: &self.config,
             heading: &heading,
@@ -241,47 +241,39 @@ impl Lookout {
             cell.measure(&scene);
         }
         self.movers.find(&mut self.cells, self.columns, &scene);
-        if let Some(speed) = metric(velocity) {
-            self.speed = Some((flow.newer, speed));
-        }
-        let recent = |(stamp, _): &(Stamp, f64)| flow.newer.seconds_since(*stamp) <= self.config.speed_hold_s;
-        let speed = self.speed.filter(recent).map(|(_, speed)| speed);
         let corridor = Corridor::new(&self.config, speed);
+        let step = step(odometer, flow, &sighting, &heading, velocity, speed, pixel);
+        if self.config.thin {
+            self.things.look(older, odometer.lens(camera_size)?, &step);
+            self.things.cover(&mut self.cells, pixel, &self.config, &corridor);
+        }
         self.sectors.gather(&self.cells, &scene, &corridor);
         self.sectors.update(&self.cells, &scene, &corridor);
         self.closing.extend(self.cells.iter().map(|cell| if cell.known { cell.closing as f32 } else { f32::NAN }));
-        let mut sectors = self.sectors.conclude(&self.config, &corridor);
+        let (mut sectors, path) = (self.sectors.conclude(&self.config, &corridor), scene.level * heading.direction);
         if self.config.thin {
-            let fitted = metric(velocity).and(velocity.as_ref().ok()).map(|velocity| Vector3::from(velocity.linear));
-            let fitted = fitted.and_then(|linear| (body.transpose() * linear).try_normalize(1e-6));
-            // Where the ground shows the velocity its direction is the better known one of the two.
-            let near = |fitted: &Vector3<f64>| fitted.dot(&heading.direction) > (DIRECTION_SDS * sd_rad).cos();
-            let direction = fitted.filter(near).unwrap_or(heading.direction);
-            let step = Step {
-                older: flow.older,
-                newer: flow.newer,
-                path: direction * (speed.unwrap_or(1.0) * sighting.interval_s),
-                metric: speed.is_some(),
-                interval_s: sighting.interval_s,
-                turn: sighting.mount.transpose() * body,
-                heading_sd_rad: sd_rad,
-                drift_sd_rad_s: odometer.config.gyro_bias_sd_rad_s,
-                pixel,
-            };
-            self.things.look(older, odometer.lens(camera_size)?, &step);
-            let path = level * body * heading.direction;
+            self.things.go_on(&step);
             self.things.tell(&mut sectors, &(level * sighting.mount), &path, &self.config, &corridor);
         }
         Ok(Obstacles {
             older: flow.older,
             newer: flow.newer,
             sectors,
-            heading: (level * body * heading.direction).into(),
+            heading: path.into(),
             heading_sd_rad: sd_rad,
             speed,
             horizon_s: 1.0 / corridor.clear,
             delay_s: self.config.delay_s,
         })
+    }
+
+    /// The speed of the newest step at which it was known well, unless that is too long ago.
+    fn hold_speed(&mut self, newer: Stamp, velocity: &Result<Velocity, Lack>) -> Option<f64> {
+        if let Some(speed) = metric(velocity) {
+            self.speed = Some((newer, speed));
+        }
+        let recent = |(stamp, _): &(Stamp, f64)| newer.seconds_since(*stamp) <= self.config.speed_hold_s;
+        self.speed.filter(recent).map(|(_, speed)| speed)
     }
 
     /// Inverse time to contact of the newest step's cells, 1/s, row by row, and how many columns there are; NaN where it
@@ -365,6 +357,35 @@ fn levelled(up: &Vector3<f64>) -> Matrix3<f64> {
 fn yaw(level: &Matrix3<f64>, turn: &UnitQuaternion<f64>) -> f64 {
     let up = level.row(2).transpose();
     turn.scaled_axis().dot(&up)
+}
+
+/// How the camera itself moved. Where the ground shows the velocity, its direction is better known than that of the flow.
+fn step(
+    odometer: &Odometer,
+    flow: &Flow<'_>,
+    sighting: &Sighting,
+    heading: &heading::Heading,
+    velocity: &Result<Velocity, Lack>,
+    speed: Option<f64>,
+    pixel: f64,
+) -> Step {
+    // Older optical axes to those of the newer body.
+    let body = sighting.turn.inverse().to_rotation_matrix().matrix() * sighting.mount;
+    let fitted = metric(velocity).and(velocity.as_ref().ok()).map(|velocity| Vector3::from(velocity.linear));
+    let fitted = fitted.and_then(|linear| (body.transpose() * linear).try_normalize(1e-6));
+    let near = |fitted: &Vector3<f64>| fitted.dot(&heading.direction) > (DIRECTION_SDS * heading.sd()).cos();
+    let direction = fitted.filter(near).unwrap_or(heading.direction);
+    Step {
+        older: flow.older,
+        newer: flow.newer,
+        path: direction * (speed.unwrap_or(1.0) * sighting.interval_s),
+        metric: speed.is_some(),
+        interval_s: sighting.interval_s,
+        turn: sighting.mount.transpose() * body,
+        heading_sd_rad: heading.sd(),
+        drift_sd_rad_s: odometer.config.gyro_bias_sd_rad_s,
+        pixel,
+    }
 }
 
 /// The speed where it is metric and known well.

@@ -8,7 +8,7 @@ use super::super::lens::Lens;
 use crate::exposure::Exposed;
 
 /// Length of a piece, developed pixels.
-const TILE: usize = 32;
+const TILE: usize = 24;
 /// Slopes from −1 to 1: over half a piece two neighbours part by half a pixel.
 const SLOPES: i32 = 16;
 /// What lies beside a ridge is looked at this far from its middle, developed pixels: a wire is narrower.
@@ -65,7 +65,7 @@ struct Peak {
 /// Scratch memory.
 #[derive(Debug, Default)]
 pub(super) struct Ridges {
-    /// Grey, so that what lies across the lines is contiguous: along × across.
+    /// Green, so that what lies across the lines is contiguous: along × across.
     plane: Vec<f32>,
     breadth: usize,
     sums: Vec<f32>,
@@ -102,17 +102,18 @@ impl Ridges {
         }
     }
 
-    /// Grey, by columns where lines run across the image, by rows where they stand.
+    /// Green, by columns where lines run across the image, by rows where they stand: red and blue of a developed pixel are
+    /// of other rows, so that in grey every edge between two colours has a dark line along it.
     fn lay(&mut self, image: &Exposed, upright: bool) {
         let (width, height) = (image.width, image.height);
         let size = width * height;
         self.breadth = if upright { width } else { height };
         self.plane.clear();
         self.plane.resize(size, 0.0);
-        let [red, green, blue] = [0, 1, 2].map(|c| image.rgb.get(c * size..(c + 1) * size).unwrap_or_default());
-        for (at, ((r, g), b)) in red.iter().zip(green).zip(blue).enumerate() {
+        let green = image.rgb.get(size..2 * size).unwrap_or_default();
+        for (at, value) in green.iter().enumerate() {
             let place = if upright { at } else { at % width * height + at / width };
-            self.plane[place] = (r + g + b) / 3.0;
+            self.plane[place] = *value;
         }
     }
 
@@ -135,11 +136,9 @@ impl Ridges {
                 let least = beside[0].abs().min(beside[1].abs());
                 let strength = least / self.spread[y];
                 if least >= CONTRAST_MIN && strength > self.pieces[y].strength.abs() {
-                    let top = [y - 1, y, y + 1].map(|y| self.curved(y).abs());
-                    let bend = top[0] - 2.0 * top[1] + top[2];
-                    let offset = if bend < 0.0 { 0.5 * (top[0] - top[2]) / bend } else { 0.0 };
+                    let offset = self.centre(y);
                     let strength = strength.copysign(beside[0]);
-                    self.pieces[y] = Piece { strength, slope, offset: offset.clamp(-0.6, 0.6) };
+                    self.pieces[y] = Piece { strength, slope, offset };
                 }
             }
         }
@@ -167,6 +166,16 @@ impl Ridges {
     /// By how much a mean is above both sides' mean.
     fn curved(&self, y: usize) -> f32 {
         self.sums[y] - 0.5 * (self.sums[y - BESIDE] + self.sums[y + BESIDE])
+    }
+
+    /// From a pixel to the centroid of what is above, or below, the line between both sides.
+    fn centre(&self, y: usize) -> f32 {
+        let tilt = (self.sums[y + BESIDE] - self.sums[y - BESIDE]) / (2 * BESIDE) as f32;
+        let floor = 0.5 * (self.sums[y - BESIDE] + self.sums[y + BESIDE]);
+        let own = self.sums[y] - floor;
+        let [before, after] = [self.sums[y - 1] - floor + tilt, self.sums[y + 1] - floor - tilt];
+        let sum = before + own + after;
+        if sum * own > 0.0 { ((after - before) / sum).clamp(-0.6, 0.6) } else { 0.0 }
     }
 
     /// What is usual around each place: noise in the sky, texture on the ground.
@@ -259,6 +268,115 @@ impl Ridges {
                 next = peak.tile + 1;
                 take(peak);
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt as _, SeedableRng as _};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+    use crate::wire::CameraInfo;
+
+    const SIZE: [usize; 2] = [320, 240];
+    const FOCAL: f64 = 211.0;
+
+    fn lens(d: &[f64]) -> Lens {
+        let k = [2.0 * FOCAL, 0.0, 319.5, 0.0, 2.0 * FOCAL, 239.5, 0.0, 0.0, 1.0];
+        let info = CameraInfo { k, d: d.to_vec(), distortion_model: "plumb_bob".into(), ..CameraInfo::default() };
+        Lens::read(&info).unwrap().unwrap()
+    }
+
+    /// A frame of half the camera's size; `value` gives a colour (0…2) at a pixel (column, row) of it.
+    fn frame(seed: u64, noise: f32, value: impl Fn(usize, [f64; 2]) -> f64) -> Exposed {
+        let mut draws = ChaCha8Rng::seed_from_u64(seed);
+        let mut noisy = |clean: f64| clean as f32 + noise * (0..12).map(|_| draws.random::<f32>() - 0.5).sum::<f32>();
+        let pixels = (0..SIZE[0] * SIZE[1]).map(|at| [(at % SIZE[0]) as f64, (at / SIZE[0]) as f64]);
+        let rgb = (0..3).flat_map(|colour| pixels.clone().map(move |at| (colour, at)));
+        let rgb = rgb.map(|(colour, at)| noisy(value(colour, at))).collect();
+        Exposed { width: SIZE[0], height: SIZE[1], scale: [2.0; 2], rgb, ..Exposed::default() }
+    }
+
+    fn find(frame: &Exposed, lens: &Lens) -> Vec<Ridge> {
+        let mut found = vec![];
+        Ridges::default().find(frame, lens, &mut found);
+        found
+    }
+
+    /// How much of a pixel a line as wide as it covers, `aside` pixels from its middle.
+    fn covered(aside: f64) -> f64 {
+        (1.0 - aside.abs()).clamp(0.0, 1.0)
+    }
+
+    /// Rays of the ends, as pixels of the frame.
+    fn pixels(ridge: &Ridge) -> [[f64; 2]; 2] {
+        ridge.ends.map(|[x, y]| [x * FOCAL + 159.5, y * FOCAL + 119.5])
+    }
+
+    #[test]
+    fn lines_of_every_slope_are_found_to_a_tenth_of_a_pixel() {
+        // A point of each line and its direction, degrees against the rows.
+        for (x, y, degrees) in [(160.0, 60.3, 0.0), (160.0, 101.7, 12.0), (150.2, 120.0, 33.0), (90.6, 120.0, 88.0)] {
+            for contrast in [-0.2, 0.2] {
+                let (sine, cosine) = f64::to_radians(degrees).sin_cos();
+                let aside = |[u, v]: [f64; 2]| (v - y) * cosine - (u - x) * sine;
+                let frame = frame(7, 0.05, |_, at| 0.4 + contrast * covered(aside(at)));
+                let found = find(&frame, &lens(&[]));
+                let near = |ridge: &&Ridge| pixels(ridge).iter().all(|end| aside(*end).abs() < 0.3);
+                let ridge = found.iter().find(near).unwrap_or_else(|| panic!("{degrees}°: {found:?}"));
+                assert_eq!(ridge.bright, contrast > 0.0);
+                let ends = pixels(ridge);
+                let middle = [0, 1].map(|i| 0.5 * (ends[0][i] + ends[1][i]));
+                assert!(aside(middle).abs() < 0.1, "{degrees}°: {} px aside", aside(middle));
+                let length = ((ends[1][0] - ends[0][0]).powi(2) + (ends[1][1] - ends[0][1]).powi(2)).sqrt();
+                assert!(length > 150.0, "{degrees}°: {length} pixels of it");
+            }
+        }
+    }
+
+    #[test]
+    fn a_line_that_the_lens_bends_is_straight() {
+        let lens = lens(&[-0.25, 0.08, 0.0, 0.0, 0.0]);
+        let y = 0.25;
+        let aside = |at: [f64; 2]| match lens.ray(at.map(|side| 2.0 * side + 0.5)) {
+            Some(ray) => (ray[1] - y) * FOCAL,
+            None => f64::INFINITY,
+        };
+        let found = find(&frame(3, 0.02, |_, at| 0.4 - 0.2 * covered(aside(at))), &lens);
+        let long = found.iter().max_by(|a, b| (a.ends[1][0] - a.ends[0][0]).total_cmp(&(b.ends[1][0] - b.ends[0][0])));
+        let ends = long.unwrap().ends;
+        assert!(ends.iter().all(|end| (end[1] - y).abs() < 0.5 / FOCAL), "{ends:?}");
+        assert!(ends[1][0] - ends[0][0] > 1.2, "all of the width: {ends:?}");
+    }
+
+    #[test]
+    fn an_edge_is_no_line_and_neither_is_the_seam_of_two_colours() {
+        let edge = |_, [_, v]: [f64; 2]| if v < 100.0 { 0.5 } else { 0.3 };
+        assert_eq!(find(&frame(1, 0.01, edge), &lens(&[])), []);
+        // Below a horizon between two rows of the camera red is of the sky and blue of the ground.
+        let seam = |colour: usize, [_, v]: [f64; 2]| match (colour, v == 100.0) {
+            (1, _) => 0.4,
+            (_, true) => 0.2,
+            _ => 0.4,
+        };
+        assert_eq!(find(&frame(1, 0.01, seam), &lens(&[])), []);
+    }
+
+    #[test]
+    fn noise_alone_hardly_makes_a_line() {
+        let count: usize = (0..20).map(|seed| find(&frame(seed, 0.1, |_, _| 0.4), &lens(&[])).len()).sum();
+        assert!(count <= 10, "{count} lines in twenty frames of noise");
+        assert_eq!(find(&frame(1, 0.0, |_, _| 0.4), &lens(&[])), [], "nor nothing at all");
+    }
+
+    #[test]
+    fn a_frame_smaller_than_a_piece_shows_none() {
+        for [width, height] in [[0, 0], [1, 1], [4, 23], [24, 3], [96, 2]] {
+            let rgb = vec![0.4; 3 * width * height];
+            let frame = Exposed { width, height, scale: [2.0; 2], rgb, ..Exposed::default() };
+            assert_eq!(find(&frame, &lens(&[])), []);
         }
     }
 }

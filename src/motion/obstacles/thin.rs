@@ -7,14 +7,21 @@
 //! turns. For every inverse time to contact of a grid the rest is linear, so that what is believed of it needs no start
 //! and is never nearer than it looks.
 
+use std::f64::consts::FRAC_PI_2;
+
 use nalgebra::{Matrix3, Unit, Vector3};
 
 use super::{
     Config, SECTORS, Sector,
+    cell::Cell,
     ridge::{Ridge, Ridges},
     sector::Corridor,
 };
-use crate::{clock::Stamp, exposure::Exposed, motion::lens::Lens};
+use crate::{
+    clock::Stamp,
+    exposure::Exposed,
+    motion::{lens::Lens, quality::below},
+};
 
 /// How far back is looked, and how far apart what is kept of it must be.
 const HISTORY_S: f64 = 2.0;
@@ -36,10 +43,14 @@ const SD_PART_MAX: f64 = 0.3;
 /// Inverse times to contact that are tried, 1/s.
 const TRIED: usize = 101;
 const TRIED_MAX: f64 = 2.0;
+/// Where it may be, a line is taken to go on beyond both its ends by this part of what is seen of it.
+const BEYOND_PART: f64 = 0.5;
+/// A cell of the flow holds what is within this many developed pixels of its middle.
+const COVERED_PX: f64 = 6.0;
 /// Things that are followed at a time.
 const THINGS_MAX: usize = 16;
 /// Places along a line at which its sectors are looked up.
-const PLACES: usize = 96;
+const PLACES: usize = 192;
 
 /// What a step knows of the camera's own motion; vectors in the optical axes of the older frame.
 pub(super) struct Step {
@@ -93,7 +104,7 @@ pub(super) struct Things {
 }
 
 impl Things {
-    /// Takes in what the older frame of a step shows, and goes on to the newer one.
+    /// Takes in what the older frame of a step shows.
     pub(super) fn look(&mut self, older: &Exposed, lens: &Lens, step: &Step) {
         if self.newest != Some((step.older, step.metric)) {
             self.spare.append(&mut self.things);
@@ -108,8 +119,32 @@ impl Things {
         self.found = found;
         for thing in &mut self.things {
             thing.closing = thing.measure(step);
-            thing.go_on(step);
         }
+    }
+
+    /// Cells that a line runs through or beside hold some of it and some of what is behind it, and the flow's mean of the two
+    /// is of neither: where the line may be in the way, what such a cell says of something later isn't known.
+    pub(super) fn cover(&self, cells: &mut [Cell], pixel: f64, config: &Config, corridor: &Corridor) {
+        for thing in self.things.iter().filter(|thing| thing.views.len() >= SEEN_MIN) {
+            let Some(View { normal, .. }) =
+                thing.views.last().filter(|_| thing.near(corridor.clear) > 1.0 - config.confidence_min)
+            else {
+                continue;
+            };
+            let later = thing.closing.map_or(f64::INFINITY, |[closing, sd]| closing + 2.0 * sd);
+            let middle = (thing.ends[0] + thing.ends[1]).normalize();
+            let half = middle.dot(&thing.ends[0]).clamp(-1.0, 1.0).acos() * (1.0 + 2.0 * BEYOND_PART);
+            let (reach, aside) = (half.min(FRAC_PI_2).cos(), COVERED_PX * pixel);
+            for cell in cells.iter_mut().filter(|cell| cell.known && cell.closing < later) {
+                let ray = Vector3::new(cell.older[0], cell.older[1], 1.0).normalize();
+                cell.known &= ray.dot(normal).abs() > aside || ray.dot(&middle) < reach;
+            }
+        }
+    }
+
+    /// Goes on to the newer frame.
+    pub(super) fn go_on(&mut self, step: &Step) {
+        self.things.iter_mut().for_each(|thing| thing.go_on(step));
         let (things, spare) = (&mut self.things, &mut self.spare);
         spare.extend(things.extract_if(.., |thing| thing.unseen_s > UNSEEN_S));
     }
@@ -148,16 +183,32 @@ impl Things {
         corridor: &Corridor,
     ) {
         for thing in self.things.iter().filter(|thing| thing.views.len() >= SEEN_MIN) {
+            // By sector: what is met later than this is not in the way, and the ray's length over its part ahead, of that
+            // place of the line which is the longest in the way.
+            let mut shown = [None::<([f64; 2], bool)>; SECTORS];
             for place in 0..PLACES {
-                let part = (place as f64 + 0.5) / PLACES as f64;
+                let part = (place as f64 + 0.5) / PLACES as f64 * (1.0 + 2.0 * BEYOND_PART) - BEYOND_PART;
+                let seen = (0.0..1.0).contains(&part);
                 let look = level * (thing.ends[0] * (1.0 - part) + thing.ends[1] * part);
                 let ahead = look.dot(path);
                 if ahead <= 1e-6 {
                     continue;
                 }
-                let leaves = corridor.leaves(config, (look - path * ahead).z / ahead);
-                let sector = &mut sectors[super::sector_of(look.y.atan2(look.x))];
-                thing.tell(sector, leaves.max(corridor.clear), corridor.speed, look.norm() / ahead, config);
+                let clear = corridor.leaves(config, (look - path * ahead).z / ahead).max(corridor.clear);
+                let shown = &mut shown[super::sector_of(look.y.atan2(look.x))];
+                let longer = |([least, _], before): ([f64; 2], bool)| (seen, -clear) > (before, -least);
+                if clear.is_finite() && shown.is_none_or(longer) {
+                    *shown = Some(([clear, look.norm() / ahead], seen));
+                }
+            }
+            for (sector, shown) in sectors.iter_mut().zip(shown) {
+                match shown {
+                    Some(([clear, stretch], true)) => {
+                        thing.tell(sector, clear, corridor.speed.map(|speed| speed * stretch), config);
+                    }
+                    Some(([clear, _], false)) => thing.doubt(sector, clear, config),
+                    None => {}
+                }
             }
         }
     }
@@ -252,26 +303,35 @@ impl Thing {
         });
     }
 
-    /// What it makes of a sector, one of whose rays shows it. What is met later than 1 / `clear` there is not in the way.
-    fn tell(&self, sector: &mut Sector, clear: f64, speed: Option<f64>, stretch: f64, config: &Config) {
-        let near = self.closing.map(|[closing, sd]| crate::motion::quality::below((closing - clear) / sd));
-        let known = self.closing.filter(|[closing, sd]| *sd <= SD_PART_MAX * closing);
-        if let (Some([closing, _]), Some(confidence)) = (known, near.filter(|near| *near >= config.confidence_min)) {
-            let ttc_s = 1.0 / closing;
-            let sooner = matches!(*sector, Sector::Occupied { ttc_s: told, .. } if told <= ttc_s);
-            if !sooner {
-                let distance_m = speed.map_or(f64::NAN, |speed| speed * ttc_s * stretch);
-                *sector = Sector::Occupied { ttc_s, distance_m, confidence, whole: false };
-            }
-            return;
-        }
-        // What may be near is not free, and what is behind it is not the nearest for certain.
-        if near.is_none_or(|near| near > 1.0 - config.confidence_min) {
-            match sector {
-                Sector::Free { .. } => *sector = Sector::Unknown,
-                Sector::Occupied { whole, .. } => *whole = false,
-                Sector::Unknown => {}
-            }
+    /// What it makes of a sector that shows it: what is met later than 1 / `clear` there is not in the way, and `speed` is
+    /// how fast its rays shorten.
+    fn tell(&self, sector: &mut Sector, clear: f64, speed: Option<f64>, config: &Config) {
+        let near = self.near(clear);
+        let known = self.closing.filter(|[closing, sd]| *sd <= SD_PART_MAX * closing && near >= config.confidence_min);
+        let Some([closing, _]) = known else { return self.doubt(sector, clear, config) };
+        // Either of the two is met, and what is met sooner stays.
+        let sure = match *sector {
+            Sector::Occupied { ttc_s, .. } if ttc_s * closing <= 1.0 => return,
+            Sector::Occupied { confidence, .. } => confidence,
+            _ => 0.0,
+        };
+        let distance_m = speed.map_or(f64::NAN, |speed| speed / closing);
+        *sector = Sector::Occupied { ttc_s: 1.0 / closing, distance_m, confidence: near.max(sure), whole: false };
+    }
+
+    /// The probability that it is met before 1 / `clear`; without a word on how near it is, it may be anywhere.
+    fn near(&self, clear: f64) -> f64 {
+        self.closing.map_or(1.0, |[closing, sd]| below((closing - clear) / sd))
+    }
+
+    /// A sector that it may be in is not free, and what is told there is not the nearest for certain.
+    fn doubt(&self, sector: &mut Sector, clear: f64, config: &Config) {
+        let away = 1.0 - self.near(clear);
+        match sector {
+            Sector::Free { .. } if away < config.confidence_min => *sector = Sector::Unknown,
+            Sector::Free { confidence } => *confidence = confidence.min(away),
+            Sector::Occupied { whole, .. } => *whole &= away >= config.confidence_min,
+            Sector::Unknown => {}
         }
     }
 }
