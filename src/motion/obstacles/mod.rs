@@ -247,7 +247,6 @@ impl Lookout {
             self.things.look(older, odometer.lens(camera_size)?, &step);
             self.things.cover(&mut self.cells, pixel, &self.config, &corridor);
         }
-        self.sectors.gather(&self.cells, &scene, &corridor);
         self.sectors.update(&self.cells, &scene, &corridor);
         self.closing.extend(self.cells.iter().map(|cell| if cell.known { cell.closing as f32 } else { f32::NAN }));
         let (mut sectors, path) = (self.sectors.conclude(&self.config, &corridor), scene.level * heading.direction);

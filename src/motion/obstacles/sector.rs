@@ -120,7 +120,7 @@ impl Sectors {
     }
 
     /// Sorts the cells of a step into their sectors.
-    pub(super) fn gather(&mut self, cells: &[Cell], scene: &Scene<'_>, corridor: &Corridor) {
+    fn gather(&mut self, cells: &[Cell], scene: &Scene<'_>, corridor: &Corridor) {
         (self.shown, self.seen) = ([0; SECTORS], [0; SECTORS]);
         let mut counts = [0; SECTORS];
         let counts_for = |cell: &Cell| -> (bool, bool) {
@@ -199,6 +199,7 @@ impl Sectors {
 
     /// Takes a step's cells into the tracks.
     pub(super) fn update(&mut self, cells: &[Cell], scene: &Scene<'_>, corridor: &Corridor) {
+        self.gather(cells, scene, corridor);
         let config = scene.config;
         let sure = (SURE_PART * corridor.clear).powi(2);
         for sector in 0..SECTORS {
