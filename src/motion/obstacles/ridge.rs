@@ -1,8 +1,8 @@
-//! Long thin lines in one frame, which no cell of the flow can hold: a wire is a pixel wide and hundreds long.
+//! Long lines and edges in one frame: no cell of the flow can hold a wire, which is a pixel wide and hundreds long.
 //!
 //! The image is summed along short pieces of line, TILE pixels long, of every slope (a discrete Radon transform by tiles);
-//! a piece is a ridge where the sum is above, or below, what lies beside it on both sides, so that an edge is none. Pieces
-//! that lie on one line make a ridge, also where what is behind hides some of them.
+//! a piece is a ridge where the sum is above, or below, what lies beside it on both sides, and an edge where the two sides
+//! differ. Pieces that lie on one line make a line, also where what is behind hides some of them.
 
 use super::super::lens::Lens;
 use crate::exposure::Exposed;
@@ -30,6 +30,8 @@ const ON_LINE_SLOPE: f64 = 0.08;
 const PIECES_MIN: usize = 4;
 /// Lines that are looked for, level and upright ones each.
 const LINES_MAX: usize = 4;
+/// An edge this near to a line, developed pixels, is the line's.
+const EDGES_PX: f64 = 4.0;
 /// Median of a standard normal's absolute value.
 const MEDIAN_ABS: f32 = 0.674_489_8;
 
@@ -37,8 +39,20 @@ const MEDIAN_ABS: f32 = 0.674_489_8;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Ridge {
     pub(super) ends: [[f64; 2]; 2],
-    /// Brighter than what is beside it, or darker.
+    /// Brighter than what is beside it, or darker; of an edge, brighter to the right of it or below.
     pub(super) bright: bool,
+    /// An edge: something else begins there.
+    pub(super) edge: bool,
+}
+
+impl Ridge {
+    /// Whether both ends of another one are within so much of the line through this one's.
+    fn beside(&self, other: &Ridge, apart: f64) -> bool {
+        let [[x, y], [to_x, to_y]] = self.ends;
+        let (along, across) = (to_x - x, to_y - y);
+        let length = (along * along + across * across).sqrt();
+        other.ends.iter().all(|end| ((end[1] - y) * along - (end[0] - x) * across).abs() < apart * length)
+    }
 }
 
 /// The strongest piece through a place of a tile's middle.
@@ -79,12 +93,12 @@ impl Ridges {
     /// Appends what a developed frame shows.
     pub(super) fn find(&mut self, image: &Exposed, lens: &Lens, found: &mut Vec<Ridge>) {
         let focal = lens.focal() / f64::from(image.scale[0]);
-        for upright in [false, true] {
+        for (upright, edge) in [(false, false), (false, true), (true, false), (true, true)] {
             self.lay(image, upright);
             self.peaks.clear();
             let tiles = if upright { image.height } else { image.width } / TILE;
             for tile in 0..tiles {
-                self.search(tile);
+                self.search(tile, edge);
                 let middle = (tile * TILE) as f64 + 0.5 * (TILE as f64 - 1.0);
                 let freed = |across: f64| {
                     let at = if upright { [across, middle] } else { [middle, across] };
@@ -97,7 +111,11 @@ impl Ridges {
             for _ in 0..LINES_MAX {
                 let Some((bright, ends)) = self.line() else { break };
                 let ray = |[along, across]: [f64; 2]| if upright { [across, along] } else { [along, across] };
-                found.push(Ridge { bright, ends: ends.map(|end| ray(end).map(|side| side / focal)) });
+                let ridge = Ridge { bright, edge, ends: ends.map(|end| ray(end).map(|side| side / focal)) };
+                // A line's own two edges are no more than the line.
+                if !found.iter().any(|line| edge && !line.edge && line.beside(&ridge, EDGES_PX / focal)) {
+                    found.push(ridge);
+                }
             }
         }
     }
@@ -118,30 +136,46 @@ impl Ridges {
     }
 
     /// The strongest piece through each place of the tile's middle line.
-    fn search(&mut self, tile: usize) {
+    fn search(&mut self, tile: usize, edge: bool) {
         let breadth = self.breadth;
         self.pieces.clear();
         self.pieces.resize(breadth, Piece::default());
         self.sum(tile, 0.0);
-        self.scale();
+        self.scale(edge);
         for step in -SLOPES..=SLOPES {
             let slope = step as f32 / SLOPES as f32;
             self.sum(tile, slope);
             let margin = BESIDE + 1 + (slope.abs() * 0.5 * TILE as f32).ceil() as usize;
             for y in margin..breadth.saturating_sub(margin) {
-                let beside = [self.sums[y] - self.sums[y - BESIDE], self.sums[y] - self.sums[y + BESIDE]];
-                if beside[0] * beside[1] <= 0.0 {
-                    continue;
-                }
-                let least = beside[0].abs().min(beside[1].abs());
-                let strength = least / self.spread[y];
-                if least >= CONTRAST_MIN && strength > self.pieces[y].strength.abs() {
-                    let offset = self.centre(y);
-                    let strength = strength.copysign(beside[0]);
+                let over = if edge { self.step(y) } else { self.above(y) };
+                let strength = over / self.spread[y];
+                if over.abs() >= CONTRAST_MIN && strength.abs() > self.pieces[y].strength.abs() {
+                    let offset = if edge { self.rise(y) } else { self.centre(y) };
                     self.pieces[y] = Piece { strength, slope, offset };
                 }
             }
         }
+    }
+
+    /// By how much a mean is above, or below, both sides' means; 0 between them.
+    fn above(&self, y: usize) -> f32 {
+        let [before, after] = [self.sums[y] - self.sums[y - BESIDE], self.sums[y] - self.sums[y + BESIDE]];
+        if before * after > 0.0 { before.abs().min(after.abs()).copysign(before) } else { 0.0 }
+    }
+
+    /// By how much the side after a place is above the side before.
+    fn step(&self, y: usize) -> f32 {
+        let side = |at: usize| self.sums[at] + self.sums[at + 1];
+        0.5 * (side(y + BESIDE) - side(y - BESIDE - 1))
+    }
+
+    /// From a pixel to the centroid of the gradient around it.
+    fn rise(&self, y: usize) -> f32 {
+        let (first, last) = (y - BESIDE, y + BESIDE);
+        let sum = self.sums[last] - self.sums[first];
+        let middle: f32 =
+            (first..last).map(|at| (at as f32 + 0.5 - y as f32) * (self.sums[at + 1] - self.sums[at])).sum();
+        if sum.abs() > 1e-6 { (middle / sum).clamp(-2.0, 2.0) } else { 0.0 }
     }
 
     /// Means along pieces of one slope, by where they cross the tile's middle; what leaves the image is left out.
@@ -179,15 +213,15 @@ impl Ridges {
     }
 
     /// What is usual around each place: noise in the sky, texture on the ground.
-    fn scale(&mut self) {
-        let (breadth, sides) = (self.breadth, BESIDE..self.breadth.saturating_sub(BESIDE));
+    fn scale(&mut self, edge: bool) {
+        let (breadth, sides) = (self.breadth, BESIDE + 1..self.breadth.saturating_sub(BESIDE + 1));
         self.spread.clear();
         self.spread.resize(breadth, f32::INFINITY);
         for y in sides.clone() {
             let near = y.saturating_sub(AROUND).max(sides.start)..(y + AROUND + 1).min(sides.end);
             self.window.clear();
             for y in near {
-                self.window.push(self.curved(y).abs());
+                self.window.push(if edge { self.step(y) } else { self.curved(y) }.abs());
             }
             let middle = self.window.len() / 2;
             let (_, median, _) = self.window.select_nth_unstable_by(middle, f32::total_cmp);
@@ -325,6 +359,7 @@ mod tests {
                 let frame = frame(7, 0.05, |_, at| 0.4 + contrast * covered(aside(at)));
                 let found = find(&frame, &lens(&[]));
                 let near = |ridge: &&Ridge| pixels(ridge).iter().all(|end| aside(*end).abs() < 0.3);
+                assert!(found.iter().all(|ridge| !near(&ridge) || !ridge.edge), "its edges are its own: {found:?}");
                 let ridge = found.iter().find(near).unwrap_or_else(|| panic!("{degrees}°: {found:?}"));
                 assert_eq!(ridge.bright, contrast > 0.0);
                 let ends = pixels(ridge);
@@ -354,7 +389,9 @@ mod tests {
     #[test]
     fn an_edge_is_no_line_and_neither_is_the_seam_of_two_colours() {
         let edge = |_, [_, v]: [f64; 2]| if v < 100.0 { 0.5 } else { 0.3 };
-        assert_eq!(find(&frame(1, 0.01, edge), &lens(&[])), []);
+        let found = find(&frame(1, 0.01, edge), &lens(&[]));
+        assert!(!found.is_empty() && found.iter().all(|ridge| ridge.edge && !ridge.bright), "{found:?}");
+        assert!(found.iter().flat_map(pixels).all(|end| (end[1] - 99.5).abs() < 0.1), "{found:?}");
         // Below a horizon between two rows of the camera red is of the sky and blue of the ground.
         let seam = |colour: usize, [_, v]: [f64; 2]| match (colour, v == 100.0) {
             (1, _) => 0.4,

@@ -1,11 +1,12 @@
-//! How far away long thin things are: a line's parallax over seconds, where its parts show no motion along it.
+//! How far away long thin things are, and poles by their edges: the parallax of a line over seconds, where its parts show no
+//! motion along it.
 //!
-//! Through the camera and a line runs a plane. With t the direction of the path, e the direction across both path and
-//! line, and the line taken as lying across the path, the plane seen from the place (a, b) along t and e has the slope
-//! y = (h − b) / (d − a) against t, d ahead and h aside of the newest place. Over the places of the last two seconds that
-//! gives 1 / d; beside it stand what the path's direction may be off by, which makes c · a of b, and what the gyro's bias
-//! turns. For every inverse time to contact of a grid the rest is linear, so that what is believed of it needs no start
-//! and is never nearer than it looks.
+//! Through the camera and a line runs a plane. With t the direction of the path and e the direction across both path and
+//! line, the plane seen from the place (a, b) along t and e has the slope y = (h − b) / (d − a) against t, where the line
+//! passes d ahead and h aside of the newest place. Over the places of the last two seconds that gives 1 / d; beside it
+//! stand what the path's direction may be off by, which makes c · a of b, and what the gyro's bias turns. For every inverse
+//! time to contact of a grid the rest is linear, so that what is believed of it needs no start. All of a line is told with
+//! that time: it is taken as lying across the path.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -84,6 +85,8 @@ struct View {
 #[derive(Debug, Clone, Default)]
 struct Thing {
     bright: bool,
+    /// It is the edge of something.
+    edge: bool,
     views: Vec<View>,
     /// Unit rays of its ends.
     ends: [Vector3<f64>; 2],
@@ -133,7 +136,7 @@ impl Things {
             };
             let later = thing.closing.map_or(f64::INFINITY, |[closing, sd]| closing + 2.0 * sd);
             let middle = (thing.ends[0] + thing.ends[1]).normalize();
-            let half = middle.dot(&thing.ends[0]).clamp(-1.0, 1.0).acos() * (1.0 + 2.0 * BEYOND_PART);
+            let half = middle.dot(&thing.ends[0]).clamp(-1.0, 1.0).acos() * (1.0 + 2.0 * thing.beyond());
             let (reach, aside) = (half.min(FRAC_PI_2).cos(), COVERED_PX * pixel);
             for cell in cells.iter_mut().filter(|cell| cell.known && cell.closing < later) {
                 let ray = Vector3::new(cell.older[0], cell.older[1], 1.0).normalize();
@@ -155,8 +158,11 @@ impl Things {
         let Some(normal) = ends[0].cross(&ends[1]).try_normalize(1e-6) else { return };
         let same = (SAME_PX * step.pixel).cos();
         let likeness = |thing: &Thing| thing.views.last().map_or(0.0, |view| view.normal.dot(&normal).abs());
-        let open =
-            self.things.iter().enumerate().filter(|(_, thing)| thing.bright == ridge.bright && thing.unseen_s > 0.0);
+        let open = self
+            .things
+            .iter()
+            .enumerate()
+            .filter(|(_, thing)| thing.unseen_s > 0.0 && (thing.bright, thing.edge) == (ridge.bright, ridge.edge));
         let best = open.map(|(i, thing)| (likeness(thing), i)).max_by(|a, b| a.0.total_cmp(&b.0));
         let at = match best.filter(|(likeness, _)| *likeness > same) {
             Some((_, at)) => at,
@@ -164,7 +170,7 @@ impl Things {
             None => {
                 let mut thing = self.spare.pop().unwrap_or_default();
                 thing.views.clear();
-                (thing.bright, thing.closing) = (ridge.bright, None);
+                (thing.bright, thing.edge, thing.closing) = (ridge.bright, ridge.edge, None);
                 self.things.push(thing);
                 self.things.len() - 1
             }
@@ -187,7 +193,7 @@ impl Things {
             // place of the line which is the longest in the way.
             let mut shown = [None::<([f64; 2], bool)>; SECTORS];
             for place in 0..PLACES {
-                let part = (place as f64 + 0.5) / PLACES as f64 * (1.0 + 2.0 * BEYOND_PART) - BEYOND_PART;
+                let part = (place as f64 + 0.5) / PLACES as f64 * (1.0 + 2.0 * thing.beyond()) - thing.beyond();
                 let seen = (0.0..1.0).contains(&part);
                 let look = level * (thing.ends[0] * (1.0 - part) + thing.ends[1] * part);
                 let ahead = look.dot(path);
@@ -307,8 +313,9 @@ impl Thing {
     /// how fast its rays shorten.
     fn tell(&self, sector: &mut Sector, clear: f64, speed: Option<f64>, config: &Config) {
         let near = self.near(clear);
-        let known = self.closing.filter(|[closing, sd]| *sd <= SD_PART_MAX * closing && near >= config.confidence_min);
-        let Some([closing, _]) = known else { return self.doubt(sector, clear, config) };
+        let Some(closing) = self.known().filter(|_| near >= config.confidence_min) else {
+            return self.doubt(sector, clear, config);
+        };
         // Either of the two is met, and what is met sooner stays.
         let sure = match *sector {
             Sector::Occupied { ttc_s, .. } if ttc_s * closing <= 1.0 => return,
@@ -319,9 +326,23 @@ impl Thing {
         *sector = Sector::Occupied { ttc_s: 1.0 / closing, distance_m, confidence: near.max(sure), whole: false };
     }
 
-    /// The probability that it is met before 1 / `clear`; without a word on how near it is, it may be anywhere.
+    /// Inverse time to contact where it is known well enough to be told.
+    fn known(&self) -> Option<f64> {
+        self.closing.filter(|[closing, sd]| *sd <= SD_PART_MAX * closing).map(|[closing, _]| closing)
+    }
+
+    /// The probability that it is met before 1 / `clear`. Without a word on how near it is, a line may be anywhere; an edge is
+    /// that of something which its own cells tell of.
     fn near(&self, clear: f64) -> f64 {
-        self.closing.map_or(1.0, |[closing, sd]| below((closing - clear) / sd))
+        match self.closing {
+            Some([closing, sd]) if !self.edge || self.known().is_some() => below((closing - clear) / sd),
+            _ => f64::from(u8::from(!self.edge)),
+        }
+    }
+
+    /// How far it goes on beyond its ends, as a part of what is seen of it.
+    fn beyond(&self) -> f64 {
+        if self.edge { 0.0 } else { BEYOND_PART }
     }
 
     /// A sector that it may be in is not free, and what is told there is not the nearest for certain.
