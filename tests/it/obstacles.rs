@@ -370,6 +370,19 @@ impl Course {
         self.image = image;
     }
 
+    /// The developed older frame, brighter by so much where a ray (second) from the camera (first) shows it.
+    fn shade(&mut self, brighter: impl Fn(&Vector3<f64>, &Vector3<f64>) -> f64) {
+        let mut image = textured(self.older_ns.cast_unsigned());
+        let plane = image.width * image.height;
+        for at in 0..plane {
+            let pixel = [at % image.width, at / image.width].map(|i| 2.0 * i as f64 + 0.5);
+            let optical = Vector3::new((pixel[0] - 319.5) / FOCAL, (pixel[1] - 239.5) / FOCAL, 1.0);
+            let more = brighter(&self.position, &(self.attitude * (Self::mount() * optical))) as f32;
+            (0..3).for_each(|c| image.rgb[c * plane + at] += more);
+        }
+        self.image = image;
+    }
+
     fn flown(&mut self, count: usize, lines: &[Line]) -> Obstacles {
         for _ in 1..count {
             self.draw(lines);
@@ -460,4 +473,44 @@ fn steps_that_are_missing_make_a_wire_a_new_one() {
     let found = course.flown(2, &lines);
     assert_eq!(occupied(found.sectors[36]), None, "its distance is not known yet");
     assert_eq!(free(&found), 0);
+}
+
+#[test]
+fn a_pole_is_timed_by_its_edges_where_the_flow_shows_what_is_behind() {
+    let pole = post([14.0, 1.8], 0.4, Vector3::z());
+    let dark = |from: &Vector3<f64>, ray: &Vector3<f64>| match pole(from, ray) {
+        Some((_, moves)) if moves.z > 0.0 => -0.2,
+        _ => 0.0,
+    };
+    for thin in [true, false] {
+        let mut course = Course::new(ground);
+        if !thin {
+            course = course.without_thin();
+        }
+        for _ in 0..25 {
+            course.shade(dark);
+            let _ = course.step();
+        }
+        course.shade(dark);
+        let found = course.step().unwrap();
+        let left = (14.0 - course.position.x) / 3.0;
+        let sector = 36 + (1.8_f64.atan2(3.0 * left).to_degrees() / 5.0).round() as usize;
+        let told = (sector - 1..=sector + 1).find_map(|sector| occupied(found.sectors[sector]));
+        assert_eq!(told.is_some(), thin, "{:?}", &found.sectors[FIELD]);
+        told.iter().for_each(|(ttc, _)| assert!(close(*ttc, left, 0.1), "{ttc} s, {left} s left"));
+        assert!(free(&found) >= 8, "{:?}", &found.sectors[FIELD]);
+    }
+}
+
+#[test]
+fn the_horizon_hides_nothing() {
+    let mut course = Course::new(ground).swaying();
+    let sky = |_: &Vector3<f64>, ray: &Vector3<f64>| if ray.z > 0.0 { 0.2 } else { 0.0 };
+    for _ in 0..20 {
+        course.shade(sky);
+        let _ = course.step();
+    }
+    course.shade(sky);
+    let found = course.step().unwrap();
+    assert!(free(&found) > 6, "{:?}", found.sectors);
 }

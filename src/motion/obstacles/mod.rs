@@ -3,7 +3,9 @@
 //! The gyro's turn is taken off each vector, the focus of expansion is found among what is left, and how far a vector
 //! reaches along its line from the focus is the inverse of the time to contact of what it belongs to. No speed and no
 //! range is needed for that; where speed is metric, times are distances too. A sector that can't be seen, for the dark,
-//! for want of texture, or because it lies outside the camera's field, is unknown and never free.
+//! for want of texture, or because it lies outside the camera's field, is unknown and never free. Wires and rods are
+//! narrower than a cell: they are found as lines in the frames and followed by their parallax, and what one of them may
+//! stand before is not free either.
 
 mod cell;
 mod config;

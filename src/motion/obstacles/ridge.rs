@@ -55,14 +55,23 @@ impl Ridge {
     }
 }
 
+/// What is looked for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Kind {
+    Line,
+    Edge,
+}
+
+const KINDS: [Kind; 2] = [Kind::Line, Kind::Edge];
+/// What is looked at around a place, developed pixels to either side.
+const MARGIN: usize = BESIDE + 1;
+
 /// The strongest piece through a place of a tile's middle.
 #[derive(Debug, Clone, Copy, Default)]
 struct Piece {
     /// Signed, in deviations of what is around it.
     strength: f32,
     slope: f32,
-    /// From the pixel to the ridge's top.
-    offset: f32,
 }
 
 /// A piece that stands out, its middle freed from the lens' distortion.
@@ -83,22 +92,24 @@ pub(super) struct Ridges {
     plane: Vec<f32>,
     breadth: usize,
     sums: Vec<f32>,
-    spread: Vec<f32>,
+    usual: Vec<f32>,
     window: Vec<f32>,
-    pieces: Vec<Piece>,
-    peaks: Vec<Peak>,
+    tops: Vec<usize>,
+    /// By kind.
+    spread: [Vec<f32>; 2],
+    pieces: [Vec<Piece>; 2],
+    peaks: [Vec<Peak>; 2],
 }
 
 impl Ridges {
     /// Appends what a developed frame shows.
     pub(super) fn find(&mut self, image: &Exposed, lens: &Lens, found: &mut Vec<Ridge>) {
         let focal = lens.focal() / f64::from(image.scale[0]);
-        for (upright, edge) in [(false, false), (false, true), (true, false), (true, true)] {
+        for upright in [false, true] {
             self.lay(image, upright);
-            self.peaks.clear();
+            self.peaks.iter_mut().for_each(Vec::clear);
             let tiles = if upright { image.height } else { image.width } / TILE;
             for tile in 0..tiles {
-                self.search(tile, edge);
                 let middle = (tile * TILE) as f64 + 0.5 * (TILE as f64 - 1.0);
                 let freed = |across: f64| {
                     let at = if upright { [across, middle] } else { [middle, across] };
@@ -106,14 +117,16 @@ impl Ridges {
                     let ray = lens.ray(pixel)?.map(|side| side * focal);
                     Some(if upright { [ray[1], ray[0]] } else { ray })
                 };
-                self.stand_out(tile, freed);
+                self.search(tile);
+                KINDS.iter().for_each(|kind| self.stand_out(tile, *kind, freed));
             }
-            for _ in 0..LINES_MAX {
-                let Some((bright, ends)) = self.line() else { break };
+            for kind in KINDS.into_iter().flat_map(|kind| [kind; LINES_MAX]) {
+                let Some((bright, ends)) = line(&mut self.peaks[kind as usize]) else { continue };
                 let ray = |[along, across]: [f64; 2]| if upright { [across, along] } else { [along, across] };
-                let ridge = Ridge { bright, edge, ends: ends.map(|end| ray(end).map(|side| side / focal)) };
+                let ends = ends.map(|end| ray(end).map(|side| side / focal));
+                let ridge = Ridge { bright, edge: kind == Kind::Edge, ends };
                 // A line's own two edges are no more than the line.
-                if !found.iter().any(|line| edge && !line.edge && line.beside(&ridge, EDGES_PX / focal)) {
+                if !found.iter().any(|line| ridge.edge && !line.edge && line.beside(&ridge, EDGES_PX / focal)) {
                     found.push(ridge);
                 }
             }
@@ -135,47 +148,32 @@ impl Ridges {
         }
     }
 
-    /// The strongest piece through each place of the tile's middle line.
-    fn search(&mut self, tile: usize, edge: bool) {
+    /// The strongest pieces through each place of the tile's middle line.
+    fn search(&mut self, tile: usize) {
         let breadth = self.breadth;
-        self.pieces.clear();
-        self.pieces.resize(breadth, Piece::default());
         self.sum(tile, 0.0);
-        self.scale(edge);
+        for kind in KINDS {
+            self.scale(kind);
+            self.pieces[kind as usize].clear();
+            self.pieces[kind as usize].resize(breadth, Piece::default());
+        }
         for step in -SLOPES..=SLOPES {
             let slope = step as f32 / SLOPES as f32;
             self.sum(tile, slope);
-            let margin = BESIDE + 1 + (slope.abs() * 0.5 * TILE as f32).ceil() as usize;
-            for y in margin..breadth.saturating_sub(margin) {
-                let over = if edge { self.step(y) } else { self.above(y) };
-                let strength = over / self.spread[y];
-                if over.abs() >= CONTRAST_MIN && strength.abs() > self.pieces[y].strength.abs() {
-                    let offset = if edge { self.rise(y) } else { self.centre(y) };
-                    self.pieces[y] = Piece { strength, slope, offset };
+            let margin = MARGIN + (slope.abs() * 0.5 * TILE as f32).ceil() as usize;
+            let inside = margin..breadth.saturating_sub(margin);
+            for kind in KINDS.into_iter().filter(|_| !inside.is_empty()) {
+                let near = around(&self.sums[inside.start - MARGIN..inside.end + MARGIN]);
+                let pieces = &mut self.pieces[kind as usize][inside.clone()];
+                for ((near, spread), piece) in near.zip(&self.spread[kind as usize][inside.clone()]).zip(pieces) {
+                    let over = kind.over(near);
+                    let strength = over / spread;
+                    if over.abs() >= CONTRAST_MIN && strength.abs() > piece.strength.abs() {
+                        *piece = Piece { strength, slope };
+                    }
                 }
             }
         }
-    }
-
-    /// By how much a mean is above, or below, both sides' means; 0 between them.
-    fn above(&self, y: usize) -> f32 {
-        let [before, after] = [self.sums[y] - self.sums[y - BESIDE], self.sums[y] - self.sums[y + BESIDE]];
-        if before * after > 0.0 { before.abs().min(after.abs()).copysign(before) } else { 0.0 }
-    }
-
-    /// By how much the side after a place is above the side before.
-    fn step(&self, y: usize) -> f32 {
-        let side = |at: usize| self.sums[at] + self.sums[at + 1];
-        0.5 * (side(y + BESIDE) - side(y - BESIDE - 1))
-    }
-
-    /// From a pixel to the centroid of the gradient around it.
-    fn rise(&self, y: usize) -> f32 {
-        let (first, last) = (y - BESIDE, y + BESIDE);
-        let sum = self.sums[last] - self.sums[first];
-        let middle: f32 =
-            (first..last).map(|at| (at as f32 + 0.5 - y as f32) * (self.sums[at + 1] - self.sums[at])).sum();
-        if sum.abs() > 1e-6 { (middle / sum).clamp(-2.0, 2.0) } else { 0.0 }
     }
 
     /// Means along pieces of one slope, by where they cross the tile's middle; what leaves the image is left out.
@@ -197,110 +195,151 @@ impl Ridges {
         }
     }
 
-    /// By how much a mean is above both sides' mean.
-    fn curved(&self, y: usize) -> f32 {
-        self.sums[y] - 0.5 * (self.sums[y - BESIDE] + self.sums[y + BESIDE])
-    }
-
-    /// From a pixel to the centroid of what is above, or below, the line between both sides.
-    fn centre(&self, y: usize) -> f32 {
-        let tilt = (self.sums[y + BESIDE] - self.sums[y - BESIDE]) / (2 * BESIDE) as f32;
-        let floor = 0.5 * (self.sums[y - BESIDE] + self.sums[y + BESIDE]);
-        let own = self.sums[y] - floor;
-        let [before, after] = [self.sums[y - 1] - floor + tilt, self.sums[y + 1] - floor - tilt];
-        let sum = before + own + after;
-        if sum * own > 0.0 { ((after - before) / sum).clamp(-0.6, 0.6) } else { 0.0 }
-    }
-
     /// What is usual around each place: noise in the sky, texture on the ground.
-    fn scale(&mut self, edge: bool) {
-        let (breadth, sides) = (self.breadth, BESIDE + 1..self.breadth.saturating_sub(BESIDE + 1));
-        self.spread.clear();
-        self.spread.resize(breadth, f32::INFINITY);
-        for y in sides.clone() {
-            let near = y.saturating_sub(AROUND).max(sides.start)..(y + AROUND + 1).min(sides.end);
+    fn scale(&mut self, kind: Kind) {
+        let breadth = self.breadth;
+        let spread = &mut self.spread[kind as usize];
+        spread.clear();
+        spread.resize(breadth, f32::INFINITY);
+        self.usual.clear();
+        self.usual.extend(around(&self.sums).map(|near| kind.usual(near).abs()));
+        let usual = &self.usual;
+        for (at, spread) in (MARGIN..).zip(&mut spread[MARGIN.min(breadth)..]).take(usual.len()) {
+            let place = at - MARGIN;
             self.window.clear();
-            for y in near {
-                self.window.push(if edge { self.step(y) } else { self.curved(y) }.abs());
-            }
+            self.window.extend_from_slice(&usual[place.saturating_sub(AROUND)..(place + AROUND + 1).min(usual.len())]);
             let middle = self.window.len() / 2;
             let (_, median, _) = self.window.select_nth_unstable_by(middle, f32::total_cmp);
-            self.spread[y] = (*median / MEDIAN_ABS).max(1e-6);
+            *spread = (*median / MEDIAN_ABS).max(1e-6);
         }
     }
 
     /// Keeps the tile's strongest pieces.
-    fn stand_out(&mut self, tile: usize, freed: impl Fn(f64) -> Option<[f64; 2]>) {
-        let first = self.peaks.len();
-        let strength = |y: usize| self.pieces.get(y).map_or(0.0, |piece| piece.strength.abs());
-        for (y, piece) in self.pieces.iter().enumerate() {
-            let own = piece.strength.abs();
-            let top = (y.saturating_sub(2)..y).all(|y| strength(y) < own) && (y + 1..y + 3).all(|y| strength(y) <= own);
-            if own < STRENGTH_MIN || !top {
+    fn stand_out(&mut self, tile: usize, kind: Kind, freed: impl Fn(f64) -> Option<[f64; 2]>) {
+        let pieces = std::mem::take(&mut self.pieces[kind as usize]);
+        let strength = |y: usize| pieces.get(y).map_or(0.0, |piece| piece.strength.abs());
+        self.tops.clear();
+        self.tops.extend((0..pieces.len()).filter(|y| {
+            let own = strength(*y);
+            let top =
+                (y.saturating_sub(2)..*y).all(|y| strength(y) < own) && (y + 1..y + 3).all(|y| strength(y) <= own);
+            own >= STRENGTH_MIN && top
+        }));
+        self.tops.sort_unstable_by(|a, b| strength(*b).total_cmp(&strength(*a)).then(a.cmp(b)));
+        self.tops.truncate(PEAKS);
+        let tops = std::mem::take(&mut self.tops);
+        for y in tops.iter().copied() {
+            let Piece { strength, slope } = pieces[y];
+            self.sum(tile, slope);
+            let offset = self.sums[y - MARGIN..].first_chunk().map_or(0.0, |near| kind.offset(near));
+            if let Some(at) = freed(y as f64 + f64::from(offset)) {
+                let peak = Peak { tile, at, slope: f64::from(slope), strength, used: false };
+                self.peaks[kind as usize].push(peak);
+            }
+        }
+        (self.pieces[kind as usize], self.tops) = (pieces, tops);
+    }
+}
+
+/// What lies around each place that has so much around it.
+fn around(sums: &[f32]) -> impl Iterator<Item = &[f32; 2 * MARGIN + 1]> {
+    sums.windows(2 * MARGIN + 1).filter_map(|near| near.first_chunk())
+}
+
+/// The line on which the strongest pieces lie that no line has yet: whether it is bright, and where it begins and ends.
+fn line(peaks: &mut [Peak]) -> Option<(bool, [[f64; 2]; 2])> {
+    let mut best = None::<(f32, usize, f64)>;
+    for (i, p) in peaks.iter().enumerate() {
+        for q in peaks.iter().filter(|q| q.tile >= p.tile + 2) {
+            let slope = (q.at[1] - p.at[1]) / (q.at[0] - p.at[0]);
+            if !q.on(p, slope) || !p.on(p, slope) {
                 continue;
             }
-            if let Some(at) = freed(y as f64 + f64::from(piece.offset)) {
-                let (slope, strength) = (f64::from(piece.slope), piece.strength);
-                self.peaks.push(Peak { tile, at, slope, strength, used: false });
+            let (mut score, mut pieces) = (0.0, 0);
+            along(peaks, p, slope, |peak| {
+                (score, pieces) = (score + peak.strength.abs().min(STRENGTH_MAX), pieces + 1);
+            });
+            if pieces >= PIECES_MIN && best.is_none_or(|best| score > best.0) {
+                best = Some((score, i, slope));
             }
         }
-        self.peaks[first..].sort_unstable_by(|a, b| b.strength.abs().total_cmp(&a.strength.abs()));
-        self.peaks.truncate(first + PEAKS);
     }
-
-    /// The line on which the strongest pieces lie that no line has yet: whether it is bright, and where it begins and ends.
-    fn line(&mut self) -> Option<(bool, [[f64; 2]; 2])> {
-        let mut best = None::<(f32, usize, f64)>;
-        for (i, p) in self.peaks.iter().enumerate() {
-            for q in self.peaks.iter().filter(|q| q.tile >= p.tile + 2) {
-                let slope = (q.at[1] - p.at[1]) / (q.at[0] - p.at[0]);
-                if !self.on(p, q, slope) || !self.on(p, p, slope) {
-                    continue;
-                }
-                let (mut score, mut pieces) = (0.0, 0);
-                self.along(p, slope, |peak| {
-                    (score, pieces) = (score + peak.strength.abs().min(STRENGTH_MAX), pieces + 1);
-                });
-                if pieces >= PIECES_MIN && best.is_none_or(|best| score > best.0) {
-                    best = Some((score, i, slope));
-                }
-            }
-        }
-        let (_, index, slope) = best?;
-        let seed = self.peaks[index];
-        let (mut n, mut x, mut y, mut xx, mut xy) = (0.0, 0.0, 0.0, 0.0, 0.0);
-        let mut reach = [f64::INFINITY, f64::NEG_INFINITY];
-        self.along(&seed, slope, |peak| {
-            let [along, across] = peak.at;
-            (n, x, y, xx, xy) = (n + 1.0, x + along, y + across, xx + along * along, xy + along * across);
-            reach = [reach[0].min(along), reach[1].max(along)];
-        });
-        let slope = (n * xy - x * y) / (n * xx - x * x);
-        let at = |along: f64| [along, (y + slope * (n * along - x)) / n];
-        for peak in &mut self.peaks {
-            peak.used |= (peak.at[1] - at(peak.at[0])[1]).abs() < 3.0 * ON_LINE_PX;
-        }
-        let half = 0.5 * TILE as f64;
-        Some((seed.strength > 0.0, [at(reach[0] - half), at(reach[1] + half)]))
+    let (_, index, slope) = best?;
+    let seed = peaks[index];
+    let (mut n, mut x, mut y, mut xx, mut xy) = (0.0, 0.0, 0.0, 0.0, 0.0);
+    let mut reach = [f64::INFINITY, f64::NEG_INFINITY];
+    along(peaks, &seed, slope, |peak| {
+        let [along, across] = peak.at;
+        (n, x, y, xx, xy) = (n + 1.0, x + along, y + across, xx + along * along, xy + along * across);
+        reach = [reach[0].min(along), reach[1].max(along)];
+    });
+    let slope = (n * xy - x * y) / (n * xx - x * x);
+    let at = |along: f64| [along, (y + slope * (n * along - x)) / n];
+    for peak in peaks {
+        peak.used |= (peak.at[1] - at(peak.at[0])[1]).abs() < 3.0 * ON_LINE_PX;
     }
+    let half = 0.5 * TILE as f64;
+    Some((seed.strength > 0.0, [at(reach[0] - half), at(reach[1] + half)]))
+}
 
-    /// Whether `peak` lies on the line through `seed`.
-    fn on(&self, seed: &Peak, peak: &Peak, slope: f64) -> bool {
-        let off = peak.at[1] - seed.at[1] - slope * (peak.at[0] - seed.at[0]);
-        !peak.used
-            && seed.strength * peak.strength > 0.0
+/// The strongest piece of each tile on the line through `seed`.
+fn along(peaks: &[Peak], seed: &Peak, slope: f64, mut take: impl FnMut(&Peak)) {
+    let mut next = 0;
+    for peak in peaks {
+        if peak.tile >= next && peak.on(seed, slope) {
+            // A tile's pieces stand in the order of their strength.
+            next = peak.tile + 1;
+            take(peak);
+        }
+    }
+}
+
+impl Peak {
+    /// Whether it lies on the line through `seed`.
+    fn on(&self, seed: &Peak, slope: f64) -> bool {
+        let off = self.at[1] - seed.at[1] - slope * (self.at[0] - seed.at[0]);
+        !self.used
+            && seed.strength * self.strength > 0.0
             && off.abs() < ON_LINE_PX
-            && (peak.slope - slope).abs() < ON_LINE_SLOPE
+            && (self.slope - slope).abs() < ON_LINE_SLOPE
+    }
+}
+
+impl Kind {
+    /// By how much the middle of means around a place is above, or below, both sides, 0 between them; or by how much the
+    /// side after it is above the side before.
+    fn over(self, near: &[f32; 2 * MARGIN + 1]) -> f32 {
+        let [_, low, _, own, _, high, _] = *near;
+        match self {
+            Kind::Line if (own - low) * (own - high) > 0.0 => {
+                (own - low).abs().min((own - high).abs()).copysign(own - low)
+            }
+            Kind::Line => 0.0,
+            Kind::Edge => self.usual(near),
+        }
     }
 
-    /// The strongest piece of each tile on the line through `seed`.
-    fn along(&self, seed: &Peak, slope: f64, mut take: impl FnMut(&Peak)) {
-        let mut next = 0;
-        for peak in &self.peaks {
-            if peak.tile >= next && self.on(seed, peak, slope) {
-                // A tile's pieces stand in the order of their strength.
-                next = peak.tile + 1;
-                take(peak);
+    /// The same for what is usual, where the middle may be between both sides.
+    fn usual(self, [lowest, low, _, own, _, high, highest]: &[f32; 2 * MARGIN + 1]) -> f32 {
+        match self {
+            Kind::Line => own - 0.5 * (low + high),
+            Kind::Edge => 0.5 * ((high + highest) - (lowest + low)),
+        }
+    }
+
+    /// From a place to the centroid of what is above, or below, the line between both sides; or to that of the gradient.
+    fn offset(self, [_, low, before, own, after, high, _]: &[f32; 2 * MARGIN + 1]) -> f32 {
+        match self {
+            Kind::Line => {
+                let (tilt, floor) = ((high - low) / (2 * BESIDE) as f32, 0.5 * (low + high));
+                let (before, own, after) = (before - floor + tilt, own - floor, after - floor - tilt);
+                let sum = before + own + after;
+                if sum * own > 0.0 { ((after - before) / sum).clamp(-0.6, 0.6) } else { 0.0 }
+            }
+            Kind::Edge => {
+                let rise = high - low;
+                let first = -1.5 * (before - low) - 0.5 * (own - before) + 0.5 * (after - own) + 1.5 * (high - after);
+                if rise.abs() > 1e-6 { (first / rise).clamp(-2.0, 2.0) } else { 0.0 }
             }
         }
     }
