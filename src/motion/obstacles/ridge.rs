@@ -28,7 +28,7 @@ const ON_LINE_PX: f64 = 0.8;
 const ON_LINE_SLOPE: f64 = 0.08;
 /// The fewest pieces of a line.
 const PIECES_MIN: usize = 4;
-/// Lines that are looked for, level and upright ones each.
+/// Lines that are looked for: level and upright ones, lines and edges, each.
 const LINES_MAX: usize = 4;
 /// An edge this near to a line, developed pixels, is the line's.
 const EDGES_PX: f64 = 4.0;
