@@ -84,11 +84,8 @@ impl Cell {
     /// Where the cell looks, for every cell that has a ray: whether it may have been seen or not.
     pub(super) fn place(&mut self, scene: &Scene<'_>) {
         let ray = Vector3::new(self.newer[0], self.newer[1], 1.0);
-        let (look, path) = (scene.level * ray, scene.level * scene.heading.direction);
-        let ahead = look.dot(&path);
-        self.sector = super::sector_of(look.y.atan2(look.x));
-        self.slope = if ahead > 1e-6 { (look - path * ahead).z / ahead } else { f64::INFINITY };
-        self.stretch = if ahead > 1e-6 { look.norm() / ahead } else { f64::INFINITY };
+        let path = scene.level * scene.heading.direction;
+        (self.sector, self.slope, self.stretch) = bearing(&(scene.level * ray), &path);
     }
 
     /// What its vector says of a point that stands still.
@@ -121,6 +118,16 @@ impl Cell {
             let turned = (shift.dot(&by) - 2.0 * shift.dot(&along) * along.dot(&by)) / length;
             turned * per - self.closing * ray.dot(&e) / ahead
         });
+    }
+}
+
+/// The sector of a ray, how steep it is against the path (up over forward), and its length over its part ahead; infinite
+/// where it does not look ahead. Both in the level frame.
+pub(super) fn bearing(look: &Vector3<f64>, path: &Vector3<f64>) -> (usize, f64, f64) {
+    let (sector, ahead) = (super::sector_of(look.y.atan2(look.x)), look.dot(path));
+    match ahead > 1e-6 {
+        true => (sector, (look - path * ahead).z / ahead, look.norm() / ahead),
+        false => (sector, f64::INFINITY, f64::INFINITY),
     }
 }
 

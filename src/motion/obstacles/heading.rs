@@ -13,7 +13,7 @@ const GUESSES: usize = 64;
 const JURY: usize = 300;
 const ROUNDS: usize = 8;
 /// Median of a standard normal's absolute value.
-const MEDIAN_ABS: f64 = 0.674_489_750_196_081_7;
+pub(super) const MEDIAN_ABS: f64 = 0.674_489_750_196_081_7;
 /// No heading is taken as known better than this, radians: mounts and gyros are not.
 const FLOOR_RAD: f64 = 0.005;
 

@@ -4,8 +4,8 @@
 //! a piece is a ridge where the sum is above, or below, what lies beside it on both sides, and an edge where the two sides
 //! differ. Pieces that lie on one line make a line, also where what is behind hides some of them.
 
-use super::super::lens::Lens;
-use crate::exposure::Exposed;
+use super::heading::MEDIAN_ABS;
+use crate::{exposure::Exposed, motion::lens::Lens};
 
 /// Length of a piece, developed pixels.
 const TILE: usize = 24;
@@ -32,8 +32,6 @@ const PIECES_MIN: usize = 4;
 const LINES_MAX: usize = 4;
 /// An edge this near to a line, developed pixels, is the line's.
 const EDGES_PX: f64 = 4.0;
-/// Median of a standard normal's absolute value.
-const MEDIAN_ABS: f32 = 0.674_489_8;
 
 /// A line, as rays (x, y, 1) of its two ends.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -120,14 +118,16 @@ impl Ridges {
                 self.search(tile);
                 KINDS.iter().for_each(|kind| self.stand_out(tile, *kind, freed));
             }
-            for kind in KINDS.into_iter().flat_map(|kind| [kind; LINES_MAX]) {
-                let Some((bright, ends)) = line(&mut self.peaks[kind as usize]) else { continue };
-                let ray = |[along, across]: [f64; 2]| if upright { [across, along] } else { [along, across] };
-                let ends = ends.map(|end| ray(end).map(|side| side / focal));
-                let ridge = Ridge { bright, edge: kind == Kind::Edge, ends };
-                // A line's own two edges are no more than the line.
-                if !found.iter().any(|line| ridge.edge && !line.edge && line.beside(&ridge, EDGES_PX / focal)) {
-                    found.push(ridge);
+            for kind in KINDS {
+                let lines = std::iter::from_fn(|| line(&mut self.peaks[kind as usize])).take(LINES_MAX);
+                for (bright, ends) in lines {
+                    let ray = |[along, across]: [f64; 2]| if upright { [across, along] } else { [along, across] };
+                    let ends = ends.map(|end| ray(end).map(|side| side / focal));
+                    let ridge = Ridge { bright, edge: kind == Kind::Edge, ends };
+                    // A line's own two edges are no more than the line.
+                    if !found.iter().any(|line| ridge.edge && !line.edge && line.beside(&ridge, EDGES_PX / focal)) {
+                        found.push(ridge);
+                    }
                 }
             }
         }
@@ -210,7 +210,7 @@ impl Ridges {
             self.window.extend_from_slice(&usual[place.saturating_sub(AROUND)..(place + AROUND + 1).min(usual.len())]);
             let middle = self.window.len() / 2;
             let (_, median, _) = self.window.select_nth_unstable_by(middle, f32::total_cmp);
-            *spread = (*median / MEDIAN_ABS).max(1e-6);
+            *spread = (*median / MEDIAN_ABS as f32).max(1e-6);
         }
     }
 

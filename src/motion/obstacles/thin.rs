@@ -14,7 +14,7 @@ use nalgebra::{Matrix3, Unit, Vector3};
 
 use super::{
     Config, SECTORS, Sector,
-    cell::Cell,
+    cell::{self, Cell},
     ridge::{Ridge, Ridges},
     sector::Corridor,
 };
@@ -196,15 +196,12 @@ impl Things {
                 let part = (place as f64 + 0.5) / PLACES as f64 * (1.0 + 2.0 * thing.beyond()) - thing.beyond();
                 let seen = (0.0..1.0).contains(&part);
                 let look = level * (thing.ends[0] * (1.0 - part) + thing.ends[1] * part);
-                let ahead = look.dot(path);
-                if ahead <= 1e-6 {
-                    continue;
-                }
-                let clear = corridor.leaves(config, (look - path * ahead).z / ahead).max(corridor.clear);
-                let shown = &mut shown[super::sector_of(look.y.atan2(look.x))];
+                let (sector, slope, stretch) = cell::bearing(&look, path);
+                let clear = corridor.leaves(config, slope).max(corridor.clear);
+                let shown = &mut shown[sector];
                 let longer = |([least, _], before): ([f64; 2], bool)| (seen, -clear) > (before, -least);
                 if clear.is_finite() && shown.is_none_or(longer) {
-                    *shown = Some(([clear, look.norm() / ahead], seen));
+                    *shown = Some(([clear, stretch], seen));
                 }
             }
             for (sector, shown) in sectors.iter_mut().zip(shown) {
